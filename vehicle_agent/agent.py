@@ -20,11 +20,11 @@ from swarm.right_of_way.holdings import Holdings, Wish
 from swarm.runtime.tracker_ownership import Trackings
 from swarm.wire.messages.orders import GoalState
 from swarm.wire.messages.planning import PlaceRouteReply, PushedRoute, RouteReply, TargetPose
-from swarm.wire.messages.vehicles import SharedCosts
+from swarm.wire.messages.vehicles import Followed, SharedCosts
 from swarm.wire.route_columns import Route, RouteStatus
 from vehicle_agent.agent_maps import LocalMap, meet
 from vehicle_agent.assignment import Assigner, Spread
-from vehicle_agent.driving.driven_vehicle import PLACES, Follow, GivenRoute, Reason, Vehicle, goal_name, goal_of
+from vehicle_agent.driving.driven_vehicle import PLACES, GivenRoute, Reason, Vehicle, goal_name, goal_of
 from vehicle_agent.driving.driver import Driver
 from vehicle_agent.driving.dynamics import PluginDynamics
 from vehicle_agent.goal_queues import REASONS, GoalQueues
@@ -32,9 +32,8 @@ from vehicle_agent.obstacles import Obstacles
 from vehicle_agent.sensing.sensor import Findings, Sensor, compare
 from vehicle_agent.sensing.target_detector import EmptyPlaces
 from vehicle_agent.target_choice import AskCosts, Assignment, GroupCosts
-from vehicle_agent.traffic.cell_requests import CellRequests
 from vehicle_agent.traffic.detours import Detours
-from vehicle_agent.traffic.next_cells import FAR_CELLS, Steering
+from vehicle_agent.traffic.next_cells import FAR_CELLS, CellRequests, Steering
 
 _LONGEST_STEP_S = 0.5
 _PATIENCE, _PATIENCE_S = 8.0, 1.0
@@ -106,9 +105,7 @@ class Agent:
         holdings.keeps = config.reserve_cells
         reach_cells = max(config.reserve_cells, FAR_CELLS) + FAR_CELLS
         near_cells, seed = reach_cells + 2, f"{scenario.seed}/{plan.id}"
-        self._wishes = CellRequests(
-            grid, self._steering, holdings, self.obstacles, near_cells, self._target_cell, self._in_reach, seed
-        )
+        self._wishes = CellRequests(self._steering, holdings, near_cells, self._target_cell, self._in_reach, seed)
         self._pulled = scenario.planner.routes == "pulled" and may_be_pulled(climb)
         self._driver = Driver(
             local_map,
@@ -492,12 +489,12 @@ class Agent:
         if any(target not in before for target in alive):
             self.assignment.ask_soon(now_ns)
 
-    def routes_given(self, request: int, reply: RouteReply | PlaceRouteReply, now_ns: int) -> list[Follow]:
+    def routes_given(self, request: int, reply: RouteReply | PlaceRouteReply, now_ns: int) -> list[Followed]:
         """A planner's answer to `AskRoutes`; returns the routes that vehicles have begun."""
         asked = self._route_requests.pop(request, None)
         if asked is None:
             return []
-        begun: list[Follow] = []
+        begun: list[Followed] = []
         pose = self._poses.get(asked.target)
         stale = (
             pose is not None
@@ -525,7 +522,7 @@ class Agent:
             if id in self.vehicles:
                 self.vehicles[id].no_answer(now_ns)
 
-    def route_pushed(self, pushed: PushedRoute, now_ns: int) -> list[Follow]:
+    def route_pushed(self, pushed: PushedRoute, now_ns: int) -> list[Followed]:
         """A newer route from a planner, unasked; returns it if the vehicle has begun it."""
         vehicle = self.vehicles.get(pushed.vehicle)
         if vehicle is None:
@@ -533,7 +530,7 @@ class Agent:
         target = goal_name(pushed.target_cell) if pushed.target is None else pushed.target
         return self._take(vehicle, target, pushed.route, now_ns, pushed=True)
 
-    def _take(self, vehicle: Vehicle, target: str, route: Route, now_ns: int, pushed: bool) -> list[Follow]:
+    def _take(self, vehicle: Vehicle, target: str, route: Route, now_ns: int, pushed: bool) -> list[Followed]:
         searching = route.status is RouteStatus.SEARCHING
         if searching and not math.isfinite(route.cost_s):
             if not pushed:

@@ -34,7 +34,7 @@ from vehicle_agent.position_reports import ChasersReport, FleetReport
 from vehicle_agent.promise_store import PromiseStore
 from vehicle_agent.right_of_way_sync import RightOfWaySync
 from vehicle_agent.sensing.sensor import SensorWorld, sensor_of
-from vehicle_agent.sensing.target_detector import TargetDetector, UntrackedTargets
+from vehicle_agent.sensing.target_detector import TargetDetector
 from vehicle_agent.start_cells import Spawning, entry_cells, spawn_cells
 from vehicle_agent.target_choice import GroupCosts
 from vehicle_agent.traffic.next_cells import FAR_CELLS
@@ -57,7 +57,6 @@ class AgentParts:
     author      under which it writes marks and reports
     flies       True if its vehicles are in the air, where no obstacles are
     near_marks  which tiles of the map concern the vehicles
-    untracked   targets known only from sightings
     costs       costs that the group's agents exchange; None if the assigner does not use them
     spawning    lets the vehicles of an added agent enter; None for an agent of the scenario
     faults      faults of plug-ins that are not reported yet
@@ -127,16 +126,15 @@ class AgentParts:
         )
         obstacles = Obstacles(grid, as_class.cost.vehicle_radius_m)
         self.agent = Agent(
-            plan, as_class, self.maps.local, sensor, core.holdings, obstacles, assigner, dynamics, self.costs
+            plan, as_class, self.maps.local, sensor, core.host, obstacles, assigner, dynamics, self.costs
         )
         self.spawning: Spawning | None = None
         if setup.added is not None:
             cells = entry_cells(setup.added, grid, own.homes, setup.incarnation)
-            self.spawning = Spawning(plan.vehicle_ids, cells, core.holdings, self.agent.is_open)
+            self.spawning = Spawning(plan.vehicle_ids, cells, core.host, self.agent.is_open)
 
         # The targets, and messages to vehicles.
-        self.detector = TargetDetector(grid, self.author, group, range_m)
-        self.untracked = UntrackedTargets(scenario.untracked, reads)
+        self.detector = TargetDetector(grid, self.author, group, range_m, reads, scenario.untracked)
         self.target_obstacles = TargetObstacles(scenario, grid)
         self.fleet = FleetReport(self.author, group, class_name)
         self.chasers = ChasersReport(self.author, class_name)

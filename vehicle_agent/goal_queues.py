@@ -118,41 +118,32 @@ class GoalQueues:
         waiting   those that wait for right of way
         """
         gone, waits = frozenset(left), frozenset(waiting)
-        return [
-            self._state(goals, vehicles.get(goals.name), goals.name in gone, stopped, goals.name in waits)
-            for goals in self.book
-        ]
-
-    def _state(
-        self,
-        goals: VehicleGoals,
-        vehicle: Vehicle | None,
-        left: bool,
-        stopped: Callable[[str], bool],
-        waits: bool,
-    ) -> GoalState:
-        state: GoalStateName = "underway"
-        reason = ""
-        if goals.off:
-            state = "canceled"
-        elif is_over(goals):
-            state = "completed"
-        elif left:
-            state = "failed"
-        elif vehicle is None:
-            state = "queued"
-        elif stopped(vehicle.id):
-            state = "standby"
-        elif vehicle.state is VehicleState.STRANDED:
-            state, refused = "blocked", self.refused.get(vehicle.id, "")
-            reason = REASONS.get(refused, refused)
-        elif vehicle.planner_gone and not vehicle.route.left:
-            state, reason = "blocked", NO_PLANNER
-        elif waits:
-            state = "delayed"
-        elif vehicle.state is VehicleState.WAITING:
-            state = "queued"
-        return GoalState(
-            name=goals.name, stamp_ns=goals.stamp_ns, done=goals.done, state=state, cell=next_cell(goals),
-            reason=reason,
-        )  # fmt: skip
+        found = []
+        for goals in self.book:
+            vehicle = vehicles.get(goals.name)
+            state: GoalStateName = "underway"
+            reason = ""
+            if goals.off:
+                state = "canceled"
+            elif is_over(goals):
+                state = "completed"
+            elif goals.name in gone:
+                state = "failed"
+            elif vehicle is None:
+                state = "queued"
+            elif stopped(vehicle.id):
+                state = "standby"
+            elif vehicle.state is VehicleState.STRANDED:
+                state, refused = "blocked", self.refused.get(vehicle.id, "")
+                reason = REASONS.get(refused, refused)
+            elif vehicle.planner_gone and not vehicle.route.left:
+                state, reason = "blocked", NO_PLANNER
+            elif goals.name in waits:
+                state = "delayed"
+            elif vehicle.state is VehicleState.WAITING:
+                state = "queued"
+            found.append(GoalState(
+                name=goals.name, stamp_ns=goals.stamp_ns, done=goals.done, state=state, cell=next_cell(goals),
+                reason=reason,
+            ))  # fmt: skip
+        return found

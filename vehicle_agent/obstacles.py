@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Container, Mapping, Sequence
+from collections.abc import Collection, Container, Mapping, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -203,10 +203,8 @@ class Obstacles:
         self.refused = 0
         self._grid = grid
         self._margin_m = margin_m
-        self._known: dict[tuple[str, int], _Known] = {}
-        """(id, incarnation) -> its newest report."""
-        self._senders: dict[str, dict[int, None]] = {}
-        """Id -> the incarnations under which it is known."""
+        self._known: dict[str, dict[int, _Known]] = {}
+        """Id -> incarnation of a sender under it -> its newest report."""
         self._closed: Counter[int] = Counter()
         """Cell -> by how many reports it is closed."""
         self._charged = 0
@@ -236,32 +234,35 @@ class Obstacles:
     def take_report(self, report: Obstacle, now_ns: int) -> None:
         """Takes in a report, after `tick` at the same time. A report older than the last one of its sender changes
         nothing."""
-        key = report.id, report.incarnation
-        known = self._known.get(key)
+        own = self._known.get(report.id, {})
+        known = own.get(report.incarnation)
         if known is not None and report.seq <= known.report.seq:
             return
         if report.lease_s <= 0.0:
             if known is not None:
-                self._forget(key)
+                self._forget(known)
             return
         leaps = known is not None and self._leaps(known.report, report, now_ns - known.came_ns)
-        charge, wrong = self._charge(report)
-        more = charge - (0 if known is None or leaps else known.charge)
-        kind = "refused"
-        if wrong is None:
-            kind, wrong = "crowded", self._crowded(known is None, more)
-        if wrong is None:
-            kind, wrong = "senders", self._outgrown(report.id, known is None, more)
-        if wrong is not None:
+        window = self._capsule(report, self._ahead_m(report, report.lease_s)).window(self._grid)
+        charge = window.cells
+        kind, wrong = self._wrong_with(
+            report, charge, charge - (0 if known is None or leaps else known.charge), known is None, own.values()
+        )
+        if wrong:
             self._complain(kind, report.id, f"is not avoided: {wrong}")
             return
-        self._meet_namesake(report, known)
+        for other in own.values():
+            if known is not None and other.heard_ns > known.heard_ns:  # one that was started again does not return
+                both = f"{other.report.incarnation} and {report.incarnation}"
+                text = f"has two senders, of incarnations {both}: both places are closed"
+                self._complain("twice", report.id, text)
+                break
         x_m, y_m = report.x_m, report.y_m
         self._standing = None
         until_ns = now_ns + int(report.lease_s * NS_PER_S)
         made = _Known(report, now_ns, now_ns, until_ns, charge, (x_m, y_m), now_ns)
         self._charged += charge
-        self._known[key] = made
+        self._known.setdefault(report.id, {})[report.incarnation] = made
         self._cover(made, now_ns)
         if known is None:
             return
@@ -281,62 +282,44 @@ class Obstacles:
         else:
             self._open(known)
 
-    def _charge(self, report: Obstacle) -> tuple[int, str | None]:
-        """Returns the largest number of cells that it may close until its lease ends, and the reason if it is
-        refused."""
+    def _wrong_with(
+        self, report: Obstacle, charge: int, more: int, is_new: bool, own: Collection[_Known]
+    ) -> tuple[str, str]:
+        """Returns why a report is refused, as the kind of a complaint and its text; both empty if it is not. An id
+        has a share: it is counted over all its senders and the places that they have left by a leap, because
+        certificates name ids.
+
+        charge  the largest number of cells that it may close until its lease ends; `more` than are charged now
+        own     reports of the same id
+        """
         if report.radius_m > MOST_RADIUS_M:
-            return 0, f"its radius_m is {report.radius_m:g}, expected at most {MOST_RADIUS_M:g}"
+            return "refused", f"its radius_m is {report.radius_m:g}, expected at most {MOST_RADIUS_M:g}"
         if report.speed_m_per_s > MOST_M_PER_S:
-            return 0, f"its speed_m_per_s is {report.speed_m_per_s:g}, expected at most {MOST_M_PER_S:g}"
-        window = self._capsule(report, self._ahead_m(report, report.lease_s)).window(self._grid)
-        if window.empty:
+            return "refused", f"its speed_m_per_s is {report.speed_m_per_s:g}, expected at most {MOST_M_PER_S:g}"
+        if not charge:
             grid, place = self._grid, f"x_m {report.x_m:.10g}, y_m {report.y_m:.10g}"
             east_m = grid.west_m + grid.cols * grid.resolution_m
             south_m = grid.north_m - grid.rows * grid.resolution_m
-            return 0, (
+            return "refused", (
                 f"{place} is outside the terrain, which has x_m {grid.west_m:.10g} ... {east_m:.10g} "
                 f"and y_m {south_m:.10g} ... {grid.north_m:.10g}"
             )
-        return window.cells, None
-
-    def _crowded(self, is_new: bool, more: int) -> str | None:
-        if is_new and len(self._known) >= MOST_OBSTACLES:
-            return f"there are {MOST_OBSTACLES} others already, as many as there may be"
+        if is_new and len(self.reports) >= MOST_OBSTACLES:
+            return "crowded", f"there are {MOST_OBSTACLES} others already, as many as there may be"
         if (charged := self._charged + more) > MOST_CELLS:
-            return f"with it, obstacles could close {charged} cells, expected at most {MOST_CELLS}"
-        return None
-
-    def _outgrown(self, id: str, is_new: bool, more: int) -> str | None:
-        """Reason why a report would give an id more than its share. It is counted over all senders of the id and
-        the places that they have left by a leap, because certificates name ids."""
-        own = [each for n in self._senders.get(id, ()) if (each := self._known.get((id, n))) is not None]
+            return "crowded", f"with it, obstacles could close {charged} cells, expected at most {MOST_CELLS}"
         if is_new and len(own) >= _MOST_SENDERS:
-            return f"{len(own)} senders have this id already"
+            return "senders", f"{len(own)} senders have this id already"
         charged = more + sum(each.charge for one in own for each in (one, *one.ghosts))
         if charged > MOST_CELLS_OF_ONE:
-            return f"with it, this id could close {charged} cells, expected at most {MOST_CELLS_OF_ONE}"
-        return None
+            return "senders", f"with it, this id could close {charged} cells, expected at most {MOST_CELLS_OF_ONE}"
+        return "", ""
 
     def _leaps(self, before: Obstacle, report: Obstacle, passed_ns: int) -> bool:
         speed = max(before.speed_m_per_s, report.speed_m_per_s)
         slack_m = _LEAP_M + self._grid.resolution_m + report.radius_m
         far_m = slack_m + 2.0 * speed * (passed_ns / NS_PER_S + REACTION_S)
         return math.hypot(report.x_m - before.x_m, report.y_m - before.y_m) > far_m
-
-    def _meet_namesake(self, report: Obstacle, known: _Known | None) -> None:
-        """Reports if two senders take turns under one id; one that was started again does not return."""
-        senders = self._senders.setdefault(report.id, {})
-        senders[report.incarnation] = None
-        if known is None or len(senders) == 1:
-            return
-        for incarnation in senders:
-            namesake = self._known.get((report.id, incarnation))
-            if namesake is not None and namesake is not known and namesake.heard_ns > known.heard_ns:
-                both = f"{incarnation} and {report.incarnation}"
-                self._complain(
-                    "twice", report.id, f"has two senders, of incarnations {both}: both places are closed"
-                )
-                return
 
     def _complain(self, kind: str, id: str, text: str) -> None:
         self.refused += 1
@@ -355,7 +338,7 @@ class Obstacles:
         self._ticked_ns = now_ns
         deaf_ns = max(passed_ns - _LONGEST_PAUSE_NS, 0)
         self._standing = None
-        for key, known in list(self._known.items()):
+        for known in self._newest():
             for each in (known, *known.ghosts):
                 if deaf_ns and each.heard_ns < now_ns - deaf_ns:
                     each.heard_ns += deaf_ns
@@ -364,7 +347,7 @@ class Obstacles:
                 known.ghosts.remove(ghost)
                 self._open(ghost)
             if now_ns >= known.until_ns:
-                self._forget(key)
+                self._forget(known)
             elif known.report.speed_m_per_s > 0.0:
                 self._cover(known, now_ns)
 
@@ -379,13 +362,11 @@ class Obstacles:
         drives."""
         self._listens_ns = now_ns + LISTEN_NS
 
-    def _forget(self, key: tuple[str, int]) -> None:
-        self._standing = None
-        known = self._known.pop(key)
-        senders = self._senders[key[0]]
-        senders.pop(key[1], None)
-        if not senders:
-            del self._senders[key[0]]
+    def _forget(self, known: _Known) -> None:
+        self._standing, own = None, self._known[known.report.id]
+        del own[known.report.incarnation]
+        if not own:
+            del self._known[known.report.id]
         for each in (known, *known.ghosts):
             self._open(each)
 
@@ -435,25 +416,26 @@ class Obstacles:
     def danger(self, cell: int) -> float:
         """Returns an urgency score for a cell. 0 if no obstacle reaches it within `MAKE_WAY_S`; higher the closer
         an obstacle passes its centre."""
-        worst = 0.0
-        for known in self._known.values():
-            if known.coming is not None:
-                worst = max(worst, known.coming.depth(self._grid, cell))
-        return worst
+        known = (known for own in self._known.values() for known in own.values())
+        comes = (each.coming for each in known if each.coming is not None)
+        return max((coming.depth(self._grid, cell) for coming in comes), default=0.0)
 
     @property
     def standing(self) -> set[int]:
         """Cells closed by obstacles that keep their places."""
         if self._standing is None:
             now_ns = self._ticked_ns or 0
-            known = (known for known in self._known.values() if now_ns - known.since_ns >= STANDS_NS)
+            known = (known for known in self._newest() if now_ns - known.since_ns >= STANDS_NS)
             self._standing = {cell for each in known for cell in each.cells}
         return self._standing
 
     @property
     def reports(self) -> list[Obstacle]:
         """The newest report of each obstacle, by each of its senders."""
-        return [known.report for known in self._known.values()]
+        return [known.report for known in self._newest()]
+
+    def _newest(self) -> list[_Known]:
+        return [known for own in self._known.values() for known in own.values()]
 
 
 # --- targets as obstacles ---

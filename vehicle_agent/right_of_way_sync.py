@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import partial
 from hashlib import blake2s
 
@@ -86,6 +87,7 @@ _WAITING_AGAIN_NS = 10 * NS_PER_S
 """Interval of repeated events: a late watcher receives them, and the log stays readable."""
 
 
+@dataclass
 class RightOfWaySync:
     """Carries an agent's right of way.
 
@@ -94,58 +96,52 @@ class RightOfWaySync:
             "slow_link", for agents that answer late; "promises", for the file of promises
     """
 
-    def __init__(
-        self,
-        core: RightOfWay,
-        setup: RoleSetup,
-        store: PromiseStore,
-        bus: Bus,
-        post: Post,
-        warn: Callable[[str, str], None],
-        *,
-        acts: bool = False,
-    ) -> None:
-        self.core = core
+    core: RightOfWay
+    setup: RoleSetup
+    store: PromiseStore
+    bus: Bus
+    post: Post
+    warn: Callable[[str, str], None]
+    acts: bool = False
+    _asked_ns: int | None = None
+    """Time of the last recovery query of this generation."""
+    _known_tag: str = ""
+    """Tag of this generation's recovery queries: what answers an earlier one is older than the shards into which
+    its successor drove."""
+    _ask_due_ns: int = 0
+    _ask_wait_ns: int = _ASK_AGAIN_NS
+    _unasked: bool = False
+    """True if an agent has appeared that has not received our recovery query."""
+    _revoked: dict[str, int] = field(default_factory=dict)
+    """Agent -> number of its newest revoked certificate."""
+    _refused: set[str] = field(default_factory=set)
+    _unled_due_ns: dict[int, int] = field(default_factory=dict)
+    """Shard without a leader -> when that is said again."""
+    _reserve_due_ns: int = 0
+    _slow_due_ns: int = 0
+    _told_silent_ns: int | None = None
+    """Time when it was last said that our seats are silent; None while they are not."""
+
+    def __post_init__(self) -> None:
+        setup = self.setup
         self._id = setup.id
-        self._store = store
-        self._bus = bus
-        self._post = post
-        self._warn = warn
-        self._acts = acts
-        seed = f"{store.own.disk}/{setup.incarnation}".encode()
+        seed = f"{self.store.own.disk}/{setup.incarnation}".encode()
         self._chance = int.from_bytes(blake2s(seed, digest_size=4).digest(), "little")
         self._own_time = OwnTime(int(NS_PER_S / setup.scenario.vehicles.tick_hz))
         """Time for the core. When to ask, and when to tell people, goes by the time of the wall."""
-        self._asked_ns: int | None = None
-        """Time of the last recovery query of this generation."""
-        self._known_tag = ""
-        """Tag of this generation's recovery queries: what answers an earlier one is older than the shards into
-        which its successor drove."""
-        self._ask_due_ns = 0
-        self._ask_wait_ns = _ASK_AGAIN_NS
-        self._unasked = False
-        """True if an agent has appeared that has not received our recovery query."""
         self._names = {f"agent.{plan.group.name}.{plan.id}": plan.id for plan in plan_agents(setup.scenario)}
         """Name in its certificate -> agent."""
-        self._revoked: dict[str, int] = {}
-        """Agent -> number of its newest revoked certificate."""
-        self._refused: set[str] = set()
-        self._unled_due_ns: dict[int, int] = {}
-        """Shard without a leader -> when that is said again."""
-        self._reserve_due_ns = self._slow_due_ns = 0
-        self._told_silent_ns: int | None = None
-        """Time when it was last said that our seats are silent; None while they are not."""
 
     def start(self, now_ns: int) -> None:
-        self._bus.watch_alive(self._post, role="agent")
-        self._bus.serve(KNOWN, self._post, agent=self._id)
-        self._bus.serve(TABLE, self._post, agent=self._id)
+        self.bus.watch_alive(self.post, role="agent")
+        self.bus.serve(KNOWN, self.post, agent=self._id)
+        self.bus.serve(TABLE, self.post, agent=self._id)
         # Not one by one for each seat: every subscription has a thread of its own, and of a large map's shards few
         # agents have hundreds of seats.
-        keep = partial(self._bus.subscribe, post=self._post) if self._acts else self._bus.collect
+        keep = partial(self.bus.subscribe, post=self.post) if self.acts else self.bus.collect
         keep(HOST_STATE, member=self._id)
-        self._bus.subscribe(TABLE, self._post, member=self._id)
-        self._bus.subscribe(STORED, self._post, member=self._id)
+        self.bus.subscribe(TABLE, self.post, member=self._id)
+        self.bus.subscribe(STORED, self.post, member=self._id)
         keep(GRANTED, host=self._id)
         if self.core.shards.proven:
             keep(WORD, host=self._id)
@@ -155,7 +151,7 @@ class RightOfWaySync:
     def on_cells_event(self, event: Event, now_ns: int) -> bool:
         """True if the event was about right of way."""
         core, own_ns = self.core, self._own_time.at(now_ns)
-        core.silent = not self._store.ready
+        core.silent = not self.store.ready
         match event:
             case Heard(message=Table() as table):
                 self._take_standings(now_ns)  # by which it is judged
@@ -192,12 +188,12 @@ class RightOfWaySync:
         drive. Yields the vehicles that have found their places by each message; they are to be placed before the
         next."""
         for topic in (LEFT, GRANTED, WORD):
-            for heard in self._bus.collected(topic):
+            for heard in self.bus.collected(topic):
                 yield self.hear(heard.message, now_ns)
 
     def is_awaited(self, message: Message) -> bool:
         """Returns True if a vehicle may be waiting for this message."""
-        holdings = self.core.holdings
+        holdings = self.core.host
         match message:
             case Left():
                 return holdings.waits
@@ -237,10 +233,10 @@ class RightOfWaySync:
         for shard, text in unled.items():
             if now_ns >= self._unled_due_ns[shard]:
                 self._unled_due_ns[shard] = now_ns + _WAITING_AGAIN_NS
-                self._warn("waiting", text)
+                self.warn("waiting", text)
 
     def _take_standings(self, now_ns: int) -> None:
-        for heard in self._bus.collected(HOST_STATE):
+        for heard in self.bus.collected(HOST_STATE):
             self.hear(heard.message, now_ns)
 
     def _tell_slow(self, now_ns: int) -> None:
@@ -251,7 +247,7 @@ class RightOfWaySync:
         elif now_ns >= self._slow_due_ns:
             self._slow_due_ns = now_ns + _SILENT_AGAIN_NS
             agent = max(slow, key=slow.__getitem__)
-            self._warn(
+            self.warn(
                 "slow_link",
                 f"agent {agent} answers slowly, after {slow[agent] / NS_PER_S:.1f} s (expected: below "
                 f"{SLOW_NS / NS_PER_S:g} s){f', and {len(slow) - 1} more' * (len(slow) > 1)}: vehicles wait longer "
@@ -263,21 +259,21 @@ class RightOfWaySync:
         if now_ns >= self._reserve_due_ns:
             self._reserve_due_ns = now_ns + _RESERVE_NS
             self._take_revoked(now_ns)
-            why = self._store.reserve()
+            why = self.store.reserve()
             told = self._told_silent_ns
-            if self._store.ready:
+            if self.store.ready:
                 if told is not None:
                     self._told_silent_ns = None
-                    self._warn("promises", "promises can be written again: this agent votes on right of way again")
+                    self.warn("promises", "promises can be written again: this agent votes on right of way again")
             elif told is None or now_ns - told >= _SILENT_AGAIN_NS:
                 self._told_silent_ns = now_ns
-                self._warn("promises", f"{why}; this agent does not vote on right of way until there is space")
-        self.core.silent = not self._store.ready
+                self.warn("promises", f"{why}; this agent does not vote on right of way until there is space")
+        self.core.silent = not self.store.ready
 
     def _take_revoked(self, now_ns: int) -> None:
         """Tells members which agents' certificates were revoked since the last look."""
         revoked: dict[str, int] = {}
-        for name in self._store.revoked():
+        for name in self.store.revoked():
             base, _, number = name.partition("~")  # a0~2 is the second certificate of a0
             agent, number = self._names.get(base), number or "1"
             if agent is not None and number.isdecimal() and len(number) <= _MOST_DIGITS:
@@ -291,19 +287,19 @@ class RightOfWaySync:
         limit."""
         shards = self.core.shards
         request = KnownRequest(
-            agent=self._id, disk=self._store.own.disk, layer=shards.layer, shard_cells=shards.side
+            agent=self._id, disk=self.store.own.disk, layer=shards.layer, shard_cells=shards.side
         )
         self._known_tag = self._known_tag or f"known-{now_ns}"
         self._asked_ns, self._unasked = now_ns, False
         self._ask_due_ns = now_ns + self._ask_wait_ns
         self._ask_wait_ns = min(2 * self._ask_wait_ns, _ASK_RARELY_NS)
-        self._bus.ask(KNOWN, request, self._post, tag=self._known_tag, timeout_s=_LATE_ANSWERS_S)
+        self.bus.ask(KNOWN, request, self.post, tag=self._known_tag, timeout_s=_LATE_ANSWERS_S)
 
     def _begin(self) -> None:
         """Begins a generation if there is none, once those who could be asked had time to answer and the promise
         file can be written."""
-        self.core.silent = not self._store.ready
-        if self._asked_ns is not None and not self.core.holdings.generation and not self.core.silent:
+        self.core.silent = not self.store.ready
+        if self._asked_ns is not None and not self.core.host.generation and not self.core.silent:
             self._perform(self.core.begin(self._chance))
 
     def _hear_claim(self, asked: Asked, epoch: int, own_ns: int) -> None:
@@ -330,31 +326,31 @@ class RightOfWaySync:
         """Sends a message to each other member of the shard."""
         for member in self.core.shards.members(message.shard):
             if member != self._id:
-                self._bus.publish(topic, message, shard=message.shard, member=member, agent=self._id)
+                self.bus.publish(topic, message, shard=message.shard, member=member, agent=self._id)
 
     def _perform(self, actions: Sequence[Action]) -> None:
         """Performs the actions of one event or tick: writes first, with one sync for all."""
         filed = [action for action in actions if isinstance(action, Save | OwnRecord)]
         for each in filed:
             if isinstance(each, Save):
-                self._store.save(each.promised, each.table)
+                self.store.save(each.promised, each.table)
             else:
-                self._store.save_own(each)
+                self.store.save_own(each)
         if filed:
-            self._store.sync()
+            self.store.sync()
         for action in actions:
             match action:
                 case AskKnown():
                     self._asked_ns, self._unasked, self._known_tag = None, True, ""  # at the next tick
                 case Tell(members, standing):
                     for member in members:
-                        self._bus.publish(HOST_STATE, standing, shard=standing.shard, member=member, agent=self._id)
+                        self.bus.publish(HOST_STATE, standing, shard=standing.shard, member=member, agent=self._id)
                 case Left():
-                    self._bus.publish(LEFT, action, host=action.host, agent=self._id)
+                    self.bus.publish(LEFT, action, host=action.host, agent=self._id)
                 case Granted():
-                    self._bus.publish(GRANTED, action, shard=action.shard, host=action.host, agent=self._id)
+                    self.bus.publish(GRANTED, action, shard=action.shard, host=action.host, agent=self._id)
                 case Word():
-                    self._bus.publish(WORD, action, shard=action.shard, host=action.host, agent=self._id)
+                    self.bus.publish(WORD, action, shard=action.shard, host=action.host, agent=self._id)
                 case Table():
                     self._tell_members(TABLE, action)
                 case Stored():
@@ -364,8 +360,8 @@ class RightOfWaySync:
                         tag = f"promise-{shard}-{epoch}"
                         claim = Claim(epoch=epoch)
                         seats: dict[str, str | int] = {"shard": shard, "member": self._id, "agent": member}
-                        self._bus.ask(TABLE, claim, self._post, tag=tag, timeout_s=_PROMISE_TIMEOUT_S, **seats)
+                        self.bus.ask(TABLE, claim, self.post, tag=tag, timeout_s=_PROMISE_TIMEOUT_S, **seats)
                 case Refused(text):
                     if text not in self._refused and len(self._refused) < _MOST_REFUSALS_TOLD:
                         self._refused.add(text)
-                        self._warn("refused", text)
+                        self.warn("refused", text)

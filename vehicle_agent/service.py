@@ -22,7 +22,7 @@ from swarm.liveness import Roster, job_of
 from swarm.runtime.obedience import Obedience
 from swarm.runtime.role_setup import RoleSetup
 from swarm.runtime.stats import GAPS_OF, GAPS_TO, UNPROVEN_OF, UNPROVEN_TO
-from swarm.wire.fields import column, pack_column
+from swarm.wire.fields import column
 from swarm.wire.messages import Message
 from swarm.wire.messages.orders import GoalState, GoalStates, Obey
 from swarm.wire.messages.planning import (
@@ -38,7 +38,6 @@ from swarm.wire.messages.planning import (
 )
 from swarm.wire.messages.traffic import Granted, HostState, Left, Word
 from swarm.wire.messages.vehicles import Followed, Obstacle, Removed, RemoveVehicles, SharedCosts, VehicleState
-from swarm.wire.route_columns import directions_of
 from swarm.wire.topics import (
     CHASERS,
     COST,
@@ -59,7 +58,7 @@ from swarm.wire.topics import (
 )
 from vehicle_agent.agent import AgentAction, AskRoutes
 from vehicle_agent.agent_parts import AgentParts
-from vehicle_agent.driving.driven_vehicle import PLACES, Follow, Places, goal_of
+from vehicle_agent.driving.driven_vehicle import PLACES, Places, goal_of
 from vehicle_agent.promise_store import PromiseStore
 from vehicle_agent.target_choice import AskCosts
 
@@ -69,8 +68,6 @@ _ANSWER_S = 2.0
 """A planner's answer is waited for at most this time, or for several round trips where the link is slow."""
 _TRIPS = 3.0
 _LONGEST_ANSWER_S = 8.0
-_PLACE = "place"
-"""The target of a route to a place, for those who watch."""
 _ROUTES, _COSTS = "route-", "cost-"
 """Tags of what we ask, each with a number."""
 
@@ -166,7 +163,7 @@ class AgentService:
         if not self._parts.flies:  # obstacles are on the ground
             bus.collect(OBSTACLE)
         self.agent.obstacles.listen_anew(now_ns)
-        if untracked := self._parts.untracked.targets:
+        if untracked := self._detector.untracked:
             bus.collect(TRUE_POSE)
             for target in sorted(untracked):
                 bus.subscribe(SIGHTED, post, target=target)
@@ -383,7 +380,7 @@ class AgentService:
 
     def _on_pose(self, pose: TargetPose, now_ns: int) -> None:
         """A tracker says where its target is."""
-        if pose.target in self._parts.untracked.targets:
+        if pose.target in self._detector.untracked:
             return
         counts = self.agent.take_pose(pose, now_ns)
         if counts is not None:  # for the simulated sensor of targets it is the truth
@@ -392,16 +389,13 @@ class AgentService:
 
     def _on_sighted(self, sighted: Sighted, now_ns: int) -> None:
         """A vehicle, of ours or of others, has seen a target."""
-        self._detector.note_sighting(sighted)
-        pose = self._parts.untracked.receive(sighted, now_ns)
+        pose = self._detector.note_sighting(sighted, now_ns)
         if pose is not None:
             self.agent.see_target(pose, now_ns)
             self._take_target_obstacles(pose, now_ns)
 
     def _tell_sighted(self, places: Places, now_ns: int) -> None:
-        untracked = self._parts.untracked
-        untracked.expire(now_ns)
-        self._detector.lose(self.agent.lost(now_ns) - untracked.targets)
+        self._detector.lose(self.agent.lost(now_ns), now_ns)
         seen = self._detector.detect(places, now_ns)
         if seen:
             self.counters.count("targets_sighted", len(seen))
@@ -513,32 +507,23 @@ class AgentService:
                     costs = CostRequest(cells=list(cells), vehicle_class=self._class)
                     self._member.ask_by_name(COST, costs, tag=f"{_COSTS}{request}", timeout_s=self._answer_s)
 
-    def _publish_followed(self, begun: Sequence[Follow]) -> None:
+    def _publish_followed(self, begun: Sequence[Followed]) -> None:
         for route in begun:
-            is_place = goal_of(route.target) is not None
-            if route.searching:
+            vehicle = self.agent.vehicles[route.vehicle]
+            if vehicle.searching:
                 self.counters.count("followed_searching")  # nothing is to be proven of these
             elif 0 < route.lower_bound_s < math.inf:
                 excess = max(route.cost_s / route.lower_bound_s - 1.0, 0.0)
                 self.counters.observe("followed_gap_excess", excess)
-                if not is_place:
+                if vehicle.goal is None:
                     self.counters.observe_by(GAPS_TO, route.target, excess)
                 self.counters.observe_by(GAPS_OF, route.vehicle, excess)
             else:
                 self.counters.count("followed_unproven")
-                if not is_place:
+                if vehicle.goal is None:
                     self.counters.count_by(UNPROVEN_TO, route.target)
                 self.counters.count_by(UNPROVEN_OF, route.vehicle)
-            followed = Followed(
-                vehicle=route.vehicle,
-                target=_PLACE if is_place else route.target,
-                start=route.cells[0],
-                directions=directions_of(route.cells, self._replica.grid.cols),
-                cost_s=route.cost_s,
-                lower_bound_s=route.lower_bound_s,
-                legs=pack_column(route.legs, "<u4"),
-            )
-            self._bus.publish(FOLLOWED, followed, agent=self._setup.id, vehicle=route.vehicle)
+            self._bus.publish(FOLLOWED, route, agent=self._setup.id, vehicle=route.vehicle)
 
 
 def _number(tag: str) -> int:

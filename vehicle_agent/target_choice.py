@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Collection, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -158,6 +158,7 @@ def have_answered(costs_s: Collection[str], allowed: Collection[str], alive: Col
     )
 
 
+@dataclass
 class Assignment:
     """Asks all planners for the costs of all vehicles of an agent, and assigns each vehicle its target.
 
@@ -169,27 +170,22 @@ class Assignment:
     group       costs of the group's other agents; None if the assigner does not ask for them
     """
 
-    def __init__(
-        self,
-        vehicles: Mapping[str, Vehicle],
-        targets: Sequence[str],
-        assigner: Assigner,
-        reassign_s: float,
-        stagger: float,
-        group: GroupCosts | None = None,
-    ) -> None:
-        self.targets = targets
-        self._vehicles = vehicles
-        self._group = group
-        self._assigner = assigner
-        self._reassign_ns = int(reassign_s * NS_PER_S)
-        self._stagger_ns = int(stagger * self._reassign_ns)
-        self._due_ns = 0
-        self._asked_ns = 0
-        """Time when it was asked last."""
-        self._open: AskCosts | None = None
-        self._costs_s: dict[str, NDArray[np.float32]] = {}
-        """Target -> the costs that its planner answered to the open request."""
+    vehicles: Mapping[str, Vehicle]
+    targets: Sequence[str]
+    assigner: Assigner
+    reassign_s: float
+    stagger: float
+    group: GroupCosts | None = None
+    _due_ns: int = 0
+    _asked_ns: int = 0
+    """Time when it was asked last."""
+    _open: AskCosts | None = None
+    _costs_s: dict[str, NDArray[np.float32]] = field(default_factory=dict)
+    """Target -> the costs that its planner answered to the open request."""
+
+    def __post_init__(self) -> None:
+        self.set_period(self.reassign_s)
+        self._stagger_ns = int(self.stagger * self._reassign_ns)
 
     def set_period(self, reassign_s: float) -> None:
         """Sets the interval of the vehicles' queries."""
@@ -210,7 +206,7 @@ class Assignment:
 
     def _choosing(self) -> dict[str, Vehicle]:
         """The vehicles that chase targets: none that was sent to a place."""
-        return {id: vehicle for id, vehicle in self._vehicles.items() if vehicle.goal is None}
+        return {id: vehicle for id, vehicle in self.vehicles.items() if vehicle.goal is None}
 
     def ask_soon(self, now_ns: int) -> None:
         """A target has a planner again, so that costs are not what they were, or vehicles are new."""
@@ -246,8 +242,8 @@ class Assignment:
             return None
         self._open = None
         stuck = not self._costs_s
-        if self._group is not None:
-            self._group.expire(now_ns - _LEASE_PERIODS * self._reassign_ns)
+        if self.group is not None:
+            self.group.expire(now_ns - _LEASE_PERIODS * self._reassign_ns)
         vehicles = self._choosing()
         shares = self._share_out(asked, vehicles, empty, standing)
         for index, id in enumerate(asked.vehicles):
@@ -260,12 +256,21 @@ class Assignment:
             there = {target: cost_s for target, cost_s in costs_s.items() if target not in empty}
             leaves = any(map(math.isfinite, there.values()))
             current = None if leaves and vehicle.target in empty else vehicle.target
-            self._assign(vehicle, there if leaves else costs_s, current, planners, now_ns)
+            offered = there if leaves else costs_s
+            given_up = vehicle.planner_gone and not vehicle.route.left
+            given_up = given_up and now_ns - vehicle.gone_since_ns > self._reassign_ns
+            target = choose(offered, self.targets, planners, current, not given_up)
+            if target is not None:
+                vehicle.assign(target, now_ns)
+                if target not in planners and not vehicle.planner_gone:
+                    vehicle.lose_planner(now_ns)
+            elif have_answered(offered, self.targets, planners):
+                vehicle.no_way()
             stuck = stuck or vehicle.state in (VehicleState.IDLE, VehicleState.STRANDED)
         if stuck:
             retry_ns = _STRANDED_RETRY_NS if self._costs_s else _RETRY_NS
             self._due_ns = min(self._due_ns, now_ns + retry_ns)
-        if self._group is None:
+        if self.group is None:
             return None
         # Input of the others: the costs of vehicles that may chase any target.
         may = [n for n, id in enumerate(asked.vehicles) if id in vehicles and id not in standing]
@@ -275,7 +280,7 @@ class Assignment:
             if target in self.targets and target not in empty
         }
         ids = [asked.vehicles[n] for n in may]
-        return self._group.tell(ids, told_s, [vehicles[id].target for id in ids], now_ns)
+        return self.group.tell(ids, told_s, [vehicles[id].target for id in ids], now_ns)
 
     def _share_out(
         self,
@@ -290,36 +295,18 @@ class Assignment:
         held = {id: vehicles[id].target for id in asked.vehicles if id in vehicles}
         now = {id: None if target in empty else target for id, target in held.items()}
         free = [n for n, id in enumerate(asked.vehicles) if id in now and now[id] in (None, *targets)]
-        if self._group is not None:
+        if self.group is not None:
             free = [n for n in free if asked.vehicles[n] not in standing]
         if not free or not targets:
             return {}
         others = None
-        if self._group is not None:
-            targets = sorted({*targets, *self._group.targets.difference(empty).intersection(self.targets)})
-            ids, table, theirs = self._group.rows(targets)
+        if self.group is not None:
+            targets = sorted({*targets, *self.group.targets.difference(empty).intersection(self.targets)})
+            ids, table, theirs = self.group.rows(targets)
             others = CostTable(tuple(targets), ids, table, theirs)
         unknown = np.full(len(asked.vehicles), np.inf)
         costs_s = np.array([self._costs_s.get(target, unknown) for target in targets], np.float64)[:, free]
         current = [-1 if (target := now[asked.vehicles[n]]) is None else targets.index(target) for n in free]
         names = tuple(asked.vehicles[n] for n in free)
-        chosen = self._assigner.assign(CostTable(tuple(targets), names, costs_s, tuple(current), others))
+        chosen = self.assigner.assign(CostTable(tuple(targets), names, costs_s, tuple(current), others))
         return {id: targets[each] for id, each in zip(names, chosen.tolist(), strict=True) if each >= 0}
-
-    def _assign(
-        self,
-        vehicle: Vehicle,
-        costs_s: Mapping[str, float],
-        current: str | None,
-        planners: Mapping[str, int],
-        now_ns: int,
-    ) -> None:
-        given_up = vehicle.planner_gone and not vehicle.route.left
-        given_up = given_up and now_ns - vehicle.gone_since_ns > self._reassign_ns
-        target = choose(costs_s, self.targets, planners, current, not given_up)
-        if target is not None:
-            vehicle.assign(target, now_ns)
-            if vehicle.target not in planners and not vehicle.planner_gone:
-                vehicle.lose_planner(now_ns)
-        elif have_answered(costs_s, self.targets, planners):
-            vehicle.no_way()

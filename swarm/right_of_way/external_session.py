@@ -11,6 +11,7 @@ import logging
 import secrets
 import threading
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
 from hashlib import blake2s
 
 from swarm.bus.bus import Appeared, AskEnded, Bus, Disappeared, Event, Heard, Post, Replied
@@ -37,6 +38,7 @@ _ASK_AGAIN_NS = NS_PER_S
 _ROLE = "rover"
 
 
+@dataclass
 class ExternalService:
     """Right of way of one vehicle that is not in the scenario, on a bus that may carry other things, too.
 
@@ -50,55 +52,47 @@ class ExternalService:
     Raises ConfigError if the name is none.
     """
 
-    def __init__(
-        self,
-        name: str,
-        grid: GridSpec,
-        incarnation: int,
-        generations: MemoryGenerations,
-        bus: Bus,
-        post: Post,
-        warn: Callable[[str], None],
-    ) -> None:
+    name: str
+    grid: GridSpec
+    incarnation: int
+    generations: MemoryGenerations
+    bus: Bus
+    post: Post
+    warn: Callable[[str], None]
+    external: ExternalVehicle | None = None
+    """None until an agent has said which agents there are."""
+    _warned: set[str] = field(default_factory=set)
+    _tag: str = ""
+    _asking: bool = False
+    _ask_due_ns: int = 0
+    _tokens: set[Peer] = field(default_factory=set)
+    _began_ns: int = 0
+    _cell: int | None = None
+    """The cell to enter, once there is an external vehicle."""
+
+    def __post_init__(self) -> None:
         try:
-            check_id("external vehicle", f"{name}-00")
+            check_id("external vehicle", f"{self.name}-00")
         except ValueError as error:
             raise ConfigError(str(error)) from error
-        self.name = name
-        self.external: ExternalVehicle | None = None
-        """None until an agent has said which agents there are."""
-        self._grid = grid
-        self._incarnation = incarnation
-        self._generations = generations
-        self._bus = bus
-        self._post = post
-        self._warn = warn
-        self._warned: set[str] = set()
-        self._tag = ""
-        self._answers = Answers(proven=bus.proves_names)
-        self._asking = False
-        self._ask_due_ns = 0
-        self._tokens: set[Peer] = set()
-        self._began_ns = 0
-        self._cell: int | None = None
-        """The cell to enter, once there is an external vehicle."""
+        self._answers = Answers(proven=self.bus.proves_names)
 
     def start(self, now_ns: int) -> None:
-        self._bus.watch_alive(self._post, role=_ROLE)
+        self.bus.watch_alive(self.post, role=_ROLE)
         for topic in (GRANTED, WORD, LEFT):
-            self._bus.subscribe(topic, self._post, host=self.name)
-        self._bus.declare_alive(Peer(_ROLE, self.name, self._incarnation))
+            self.bus.subscribe(topic, self.post, host=self.name)
+        self.bus.declare_alive(Peer(_ROLE, self.name, self.incarnation))
         self._began_ns = now_ns
         self._ask(now_ns)
 
     def stop(self) -> None:
         for topic in (GRANTED, WORD, LEFT):
-            self._bus.unsubscribe(topic, host=self.name)
+            self.bus.unsubscribe(topic, host=self.name)
 
     def enter(self, cell: int, now_ns: int) -> None:
         """Asks for the cell on which the vehicle stands. Raises as `ExternalVehicle.enter`."""
-        if not 0 <= cell < self._grid.cells:
-            raise ValueError(f"cell {cell} is outside the map of {self._grid.cells} cells")
+        if not 0 <= cell < self.grid.cells:
+            raise ValueError(f"cell {cell} is outside the map of {self.grid.cells} cells")
         self._cell = cell
         if self.external is not None:
             self.external.enter(cell)
@@ -113,15 +107,14 @@ class ExternalService:
             self.external.leave()
         self.tell(now_ns)
 
-    def on_external_event(self, event: Event, now_ns: int) -> bool:
-        """True if the event was about the right of way of this external vehicle."""
+    def on_external_event(self, event: Event, now_ns: int) -> None:
+        """Takes up an event about the right of way of this external vehicle; any other changes nothing."""
+        external = self.external
         match event:
-            case Heard(message=(Granted() | Word()) as granted) if granted.host == self.name:
-                if self.external is not None:
-                    self.external.hear_granted(granted, now_ns)
-            case Heard(topic=topic, message=Left() as left) if topic is LEFT and left.host == self.name:
-                if self.external is not None:
-                    self.external.hear_left(left)
+            case Heard(message=(Granted() | Word()) as granted) if external and granted.host == self.name:
+                external.host.hear_granted(granted, now_ns)
+            case Heard(message=Left() as left) if external:
+                external.host.hear_left(left)
             case Replied(tag=self._tag, message=Known() as known):
                 self._take_answers(self._answers.hear(known))
             case AskEnded(tag=self._tag):
@@ -131,26 +124,28 @@ class ExternalService:
                 if self.external is not None:
                     self._perform(self.external.begin(self._chance(now_ns)), now_ns)
                     self.tell(now_ns)
-            case Appeared(peer=peer) if (peer.role, peer.id) == (_ROLE, self.name):
-                self._hear_token(peer, up=True)
-            case Disappeared(peer=peer) if (peer.role, peer.id) == (_ROLE, self.name):
-                self._hear_token(peer, up=False)
+            case Appeared(peer=peer) | Disappeared(peer=peer) if (peer.role, peer.id) == (_ROLE, self.name):
+                up = isinstance(event, Appeared)
+                (self._tokens.add if up else self._tokens.discard)(peer)
+                if external:
+                    external.host.hear_token(peer, up=up)
             case _:
-                return False
-        return True
+                pass
 
     def tick(self, now_ns: int) -> None:
-        settled = self.external is not None and self.external.settled
-        if not settled and not self._asking and now_ns >= self._ask_due_ns:
+        external = self.external
+        if not (self._asking or (external is not None and external.settled)) and now_ns >= self._ask_due_ns:
             self._ask(now_ns)
-        if self.external is None and now_ns - self._began_ns > _NOBODY_NS:
-            self._warn_once(
-                (f"no agent answers {self.name}: it needs one that drives in this run, and a name of its own",)
-            )
+        if external is None:
+            if now_ns - self._began_ns > _NOBODY_NS:
+                self._warn_once(
+                    f"no agent answers {self.name}: it needs one that drives in this run, and a name of its own"
+                )
+            return
         self.tell(now_ns)
-        if self.external is not None:
-            self._warn_once((*self.external.refused, *self.external.unled(now_ns)))
-            self.external.refused.clear()
+        for text in (*external.host.refused, *external.host.unled(now_ns).values()):
+            self._warn_once(text)
+        external.host.refused.clear()
 
     def tell(self, now_ns: int) -> None:
         """Sends new statements without waiting for the next tick."""
@@ -158,32 +153,30 @@ class ExternalService:
             self._perform(self.external.tick(now_ns), now_ns)
 
     def _take_answers(self, agreed: Sequence[Known]) -> None:
-        known = agreed[0] if agreed else None
-        if known is not None and (self.external is None or _tells_of_larger(known, self.external)):
+        if not agreed:
+            return
+        known, external = agreed[0], self.external
+        # An agent tells of larger shards only if the whole run has them; one that says less may not belong.
+        if external is None or (known.shard_cells > external.host.shards.side and not external.cells):
             if self.name in known.agents:
                 self._warn_once(
-                    (f"{self.name} is an agent of this run's scenario: an external vehicle needs another name",)
+                    f"{self.name} is an agent of this run's scenario: an external vehicle needs another name"
                 )
                 return
-            shards = Shards(self._grid, known.agents, known.shard_cells, proven=self._bus.proves_names)
-            self.external = ExternalVehicle(shards, self.name, self._generations.generations)
+            shards = Shards(self.grid, known.agents, known.shard_cells, proven=self.bus.proves_names)
+            self.external = external = ExternalVehicle(shards, self.name, self.generations.generations)
             for peer in self._tokens:
-                self.external.hear_token(peer, up=True)
+                external.host.hear_token(peer, up=True)
             if self._cell is not None:
-                self.external.enter(self._cell)
+                external.enter(self._cell)
         for known in agreed:
-            if self.external is not None and known.shard_cells == self.external.shards.side:
-                self.external.hear_known(known)
-
-    def _hear_token(self, peer: Peer, *, up: bool) -> None:
-        (self._tokens.add if up else self._tokens.discard)(peer)
-        if self.external is not None:
-            self.external.hear_token(peer, up=up)
+            if known.shard_cells == external.host.shards.side:
+                external.host.hear_known(known)
 
     def _ask(self, now_ns: int) -> None:
         self._asking, self._tag = True, f"known-{self.name}-{now_ns}"  # what answers an earlier query is too old
         request = KnownRequest(agent=self.name, disk=0)
-        self._bus.ask(KNOWN, request, self._post, tag=self._tag, timeout_s=_ANSWERS_S)
+        self.bus.ask(KNOWN, request, self.post, tag=self._tag, timeout_s=_ANSWERS_S)
 
     def _perform(self, actions: Sequence[object], now_ns: int) -> None:
         for action in actions:
@@ -191,30 +184,21 @@ class ExternalService:
                 case AskKnown():
                     self._ask(now_ns)
                 case SaveGenerations(generations):
-                    self._generations.save(generations)
+                    self.generations.save(generations)
                 case Left() as left:
-                    self._bus.publish(LEFT, left, host=left.host, agent=self.name)
+                    self.bus.publish(LEFT, left, host=left.host, agent=self.name)
                 case Tell(members, standing):
                     for member in members:
-                        self._bus.publish(
-                            HOST_STATE, standing, shard=standing.shard, member=member, agent=self.name
-                        )
+                        self.bus.publish(HOST_STATE, standing, shard=standing.shard, member=member, agent=self.name)
 
     def _chance(self, now_ns: int) -> int:
-        seed = f"{self.name}/{self._incarnation}/{now_ns}".encode()
+        seed = f"{self.name}/{self.incarnation}/{now_ns}".encode()
         return int.from_bytes(blake2s(seed, digest_size=4).digest(), "little")
 
-    def _warn_once(self, texts: Sequence[str]) -> None:
-        for text in texts:
-            if text not in self._warned and len(self._warned) < 100:
-                self._warned.add(text)
-                self._warn(text)
-
-
-def _tells_of_larger(known: Known, external: ExternalVehicle) -> bool:
-    """Returns True if shards are larger than the external vehicle assumes. An agent says so only if this is so for
-    the whole run; one that says less may not belong."""
-    return known.shard_cells > external.shards.side and not external.cells
+    def _warn_once(self, text: str) -> None:
+        if text not in self._warned and len(self._warned) < 100:
+            self._warned.add(text)
+            self.warn(text)
 
 
 log = logging.getLogger(__name__)
@@ -286,7 +270,7 @@ class ExternalSession:
         """True if another process has taken the name: this vehicle must stand still, and its cells stay shut."""
         with self._changed:
             external = self._service.external
-            return external is not None and external.replaced
+            return external is not None and external.host.replaced
 
     def enter(self, cell: int, timeout_s: float | None = None) -> bool:
         """Asks for the cell where the vehicle stands. Returns whether it is granted within `timeout_s`; None asks
@@ -424,12 +408,12 @@ def say_gone(bus: Bus, name: str, grid: GridSpec, timeout_s: float) -> bool:
                         raise ConfigError(
                             f"{name} is an agent of the scenario, not an external vehicle: start it again instead"
                         )
-                    if removal is None or (not begun and known.shard_cells > removal.shards.side):
+                    if removal is None or (not begun and known.shard_cells > removal.host.shards.side):
                         shards = Shards(grid, known.agents, known.shard_cells, proven=bus.proves_names)
                         removal = Removal(shards, name)
-                    if known.shard_cells == removal.shards.side:
+                    if known.shard_cells == removal.host.shards.side:
                         removal.hear_known(known)
-            case AskEnded() if removal is not None and not begun and removal.settled:
+            case AskEnded() if removal is not None and not begun and removal.host.informed:
                 if not removal.known:
                     raise ConfigError(f"no agent knows an external vehicle {name!r}")
                 removal.begin(secrets.randbits(32))
@@ -438,7 +422,7 @@ def say_gone(bus: Bus, name: str, grid: GridSpec, timeout_s: float) -> bool:
                 answers.end_query()
                 bus.ask(KNOWN, KnownRequest(agent=name, disk=0), inbox.post, tag="known", timeout_s=_WORDS_S)
             case Heard(message=(Granted() | Word()) as granted) if removal is not None:
-                removal.hear_granted(granted, now_ns)
+                removal.host.hear_granted(granted, now_ns)
             case _:
                 pass
         if removal is not None and begun and now_ns >= due_ns:

@@ -9,12 +9,11 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 from swarm.clock import NS_PER_S
-from swarm.liveness import Peer
 from swarm.right_of_way.holdings import MOST_AHEAD, Tell, Wish
 from swarm.right_of_way.host import GENERATIONS_KEPT, AskKnown, Host
 from swarm.right_of_way.shards import Shards
 from swarm.wire.fields import MOST_IDS
-from swarm.wire.messages.traffic import Granted, Known, Left, Word
+from swarm.wire.messages.traffic import Known, Left
 
 _QUERIES_ALONE = 5
 """Queries that only one agent answers before it is believed: another that runs answers one within seconds."""
@@ -80,13 +79,14 @@ class ExternalVehicle:
     name         of the external vehicle; its vehicle is called `name-00`
     generations  of it that are on the file which this process has locked: they have ended
 
+    host              its part in right of way, which hears messages. If that is replaced, another process speaks
+                      for the vehicle: it stands where it stands, and must not move
     needs_generation  whether it wants to enter and waits for `begin`
     """
 
     def __init__(self, shards: Shards, name: str, generations: Sequence[int] = ()) -> None:
         self.vehicle = f"{name}-00"
-        self.shards = shards
-        self._host = Host(shards, name, [self.vehicle])
+        self.host = Host(shards, name, [self.vehicle])
         self._generations = list(generations)
         self._cell: int | None = None
         """Its cell, or the one that it would enter; None while it is away."""
@@ -103,38 +103,27 @@ class ExternalVehicle:
     @property
     def cells(self) -> tuple[int, ...]:
         """The cells that it may stand on and enter, in driving order, its own first."""
-        return () if self.replaced else tuple(self._host.holdings.open(self.vehicle))
-
-    @property
-    def replaced(self) -> bool:
-        """True if another process represents this external vehicle. It stands where it stands, and must not
-        move."""
-        return self._host.holdings.replaced
+        return () if self.host.replaced else tuple(self.host.open(self.vehicle))
 
     @property
     def gone(self) -> bool:
         """True if it holds and requests nothing, and every leader that it contacted knows."""
-        return self._cell is None and (not self._host.holdings.generation or self._host.holdings.gone)
+        return self._cell is None and (not self.host.generation or self.host.gone)
 
     @property
     def needs_generation(self) -> bool:
-        return self._cell is not None and not self._host.holdings.generation
-
-    @property
-    def refused(self) -> list[str]:
-        """Sentences about impossible statements; the reader clears them."""
-        return self._host.holdings.refused
+        return self._cell is not None and not self.host.generation
 
     def enter(self, cell: int) -> None:
         """Asks for the cell on which it stands, or wants to begin. Raises ValueError where it has one already, or
         there is none."""
         if self.cells:
             raise ValueError(f"it holds cell {self.cells[0]}: leave before it enters elsewhere")
-        if self.shards.of(cell) < 0:
-            raise ValueError(f"cell {cell} is outside the map of {self.shards.grid.cells} cells")
+        if self.host.shards.of(cell) < 0:
+            raise ValueError(f"cell {cell} is outside the map of {self.host.shards.grid.cells} cells")
         self._cell = cell
-        if self._host.holdings.generation and not self.replaced:
-            self._host.holdings.enter(self.vehicle, cell)
+        if self.host.generation and not self.host.replaced:
+            self.host.enter(self.vehicle, cell)
 
     def want(self, path: Sequence[int], aside: Sequence[int] = ()) -> None:
         """States where it would go. Cells that it holds and that are not the beginning of this path are given back.
@@ -144,45 +133,41 @@ class ExternalVehicle:
 
         Raises ValueError if the path does not begin where it stands, or leaps, or it has not entered.
         """
-        held = () if self.replaced else self._host.holdings.path(self.vehicle)
+        held = () if self.host.replaced else self.host.path(self.vehicle)
         if not held or not path or path[0] != held[0]:
             where = f"cell {held[0]}" if held else "no cell"
             raise ValueError(f"the path must begin at the vehicle's cell: it holds {where}")
         for tail, head in pairwise(path):
-            if self.shards.of(head) < 0 or not self.shards.adjacent(tail, head):
+            if self.host.shards.of(head) < 0 or not self.host.shards.adjacent(tail, head):
                 raise ValueError(f"cell {head} of the path is not next to cell {tail}")
         same = next(
             (n for n, (a, b) in enumerate(zip(held, path, strict=False)) if a != b), min(len(held), len(path))
         )
         if same < len(held):
-            self._host.holdings.give_back(self.vehicle, same)
+            self.host.give_back(self.vehicle, same)
         self._path = tuple(path)
-        self._aside = tuple(cell for cell in aside if self.shards.adjacent(held[0], cell))
+        self._aside = tuple(cell for cell in aside if self.host.shards.adjacent(held[0], cell))
 
     def left(self, cell: int) -> None:
         """It has driven out of a cell, into the next that it holds. Raises ValueError if it holds none after it."""
         held = self.cells
         if cell not in held[:-1]:
             raise ValueError(f"it cannot have left cell {cell}: it holds {list(held)}")
-        self._host.holdings.moved(self.vehicle, held[held.index(cell) + 1])
+        self.host.moved(self.vehicle, held[held.index(cell) + 1])
         self._cell = self.cells[0]
 
     def leave(self) -> None:
         """It stands nowhere any more: its cells are free for others once leaders have heard."""
         self._cell = None
         self._path = self._aside = ()
-        self._host.holdings.leave(self.vehicle)
+        self.host.leave(self.vehicle)
 
-    # --- what is heard --------------------------------------------------------------------------------------
+    # --- messages -------------------------------------------------------------------------------------------
 
     @property
     def settled(self) -> bool:
         """True if no recovery query is pending."""
-        return not self.needs_generation and self._host.informed
-
-    def hear_known(self, known: Known) -> None:
-        """An agent's answer to `AskKnown`."""
-        self._host.hear_known(known.agent, known.generation, known.shards)
+        return not self.needs_generation and self.host.informed
 
     def begin(self, chance: int) -> list[ExternalAction]:
         """Begins a generation, once all agents that could be asked have answered.
@@ -192,53 +177,37 @@ class ExternalVehicle:
         if not self.needs_generation:
             return []
         assert self._cell is not None
-        self._generations = self._host.begin(self._generations, chance)
-        self._host.holdings.enter(self.vehicle, self._cell)
+        self._generations = self.host.begin(self._generations, chance)
+        self.host.enter(self.vehicle, self._cell)
         return [SaveGenerations(self._generations)]
-
-    def hear_granted(self, granted: Granted | Word, now_ns: int) -> bool:
-        """A leader's grant, or a member's word on one. Returns True if the vehicle has entered by it."""
-        return bool(self._host.hear_granted(granted, now_ns))
-
-    def hear_left(self, left: Left) -> bool:
-        """Another host's word to us. Returns True if the vehicle has entered by it."""
-        return bool(self._host.hear_left(left))
-
-    def hear_token(self, peer: Peer, *, up: bool) -> None:
-        """The liveliness token of another process has risen or fallen."""
-        self._host.hear_token(peer, up=up)
-
-    def unled(self, now_ns: int) -> list[str]:
-        """Reason why it waits: shards of which no leader is heard."""
-        return list(self._host.unled(now_ns).values())
 
     def tick(self, now_ns: int) -> list[ExternalAction]:
         """Returns the messages to send in this tick."""
-        if self.replaced:
+        if self.host.replaced:
             # Not that it has ended, as a host would: its vehicle still stands there.
-            return [AskKnown()] if self._host.ended_alone(now_ns) and self._cell is not None else []
+            return [AskKnown()] if self.host.ended_alone(now_ns) and self._cell is not None else []
         self._wait(now_ns)
-        standings = self._host.standings({self.vehicle: self._wish_now(now_ns)}, now_ns)
-        return [*self._host.lefts(now_ns), *standings]
+        standings = self.host.standings({self.vehicle: self._wish_now(now_ns)}, now_ns)
+        return [*self.host.lefts(now_ns), *standings]
 
     def _wait(self, now_ns: int) -> None:
         """Gives back what it waits for in vain, so that no circle of waiting lasts."""
-        held, free = self._host.holdings.path(self.vehicle), len(self.cells)
+        held, free = self.host.path(self.vehicle), len(self.cells)
         before, self._waits_ns = self._waits_ns, None
         if len(held) > free:
             cell, since_ns = before if before and before[0] == held[free] else (held[free], now_ns)
             if now_ns - since_ns > _PATIENCE_NS:
-                self._host.holdings.give_back(self.vehicle, free)
+                self.host.give_back(self.vehicle, free)
             else:
                 self._waits_ns = cell, since_ns
 
     def _wish_now(self, now_ns: int) -> Wish:
-        held, path = self._host.holdings.path(self.vehicle), self._path
+        held, path = self.host.path(self.vehicle), self._path
         after = path.index(held[-1]) + 1 if held and held[-1] in path else len(path)
         ahead = list(path[after : after + max(MOST_AHEAD + 1 - len(held), 0)])
         self._since_ns = (self._since_ns or now_ns) if ahead else None
         wants = list(dict.fromkeys((*ahead[:1], *self._aside))) if len(held) == 1 else []
-        pushed = self._host.holdings.pushed.get(self.vehicle, 0)
+        pushed = self.host.pushed.get(self.vehicle, 0)
         better = len(wants) if pushed else len(ahead[:1]) if wants else 0
         # In whole seconds, so that a wish is the same object while nothing happens.
         age_s = (now_ns - self._since_ns) // NS_PER_S if self._since_ns is not None else 0
@@ -254,11 +223,12 @@ class Removal:
 
     It is a new generation of the external vehicle, which proves by the operator's word that all before it have
     ended, and holds nothing. A process that still speaks for the external vehicle stops as soon as it hears of it.
+
+    host  hears messages; if it is replaced, the external vehicle has begun a later generation meanwhile
     """
 
     def __init__(self, shards: Shards, name: str) -> None:
-        self.shards = shards
-        self._host = Host(shards, name, None)
+        self.host = Host(shards, name, None)
         self._generations: set[int] = set()
 
     @property
@@ -269,29 +239,16 @@ class Removal:
     @property
     def done(self) -> bool:
         """True if every leader that had cells of the external vehicle has freed them."""
-        return self._host.holdings.generation > 0 and self._host.holdings.gone and self.settled
-
-    @property
-    def settled(self) -> bool:
-        """True if enough agents have replied that no shard can be missing."""
-        return self._host.informed
-
-    @property
-    def replaced(self) -> bool:
-        """True if the external vehicle has begun a later generation meanwhile."""
-        return self._host.holdings.replaced
+        return self.host.generation > 0 and self.host.gone and self.host.informed
 
     def hear_known(self, known: Known) -> None:
         self._generations.update(known.generations)
-        self._host.hear_known(known.agent, known.generation, known.shards)
+        self.host.hear_known(known)
 
     def begin(self, chance: int) -> None:
         """Once all agents that could be asked have answered."""
-        self._host.begin(sorted(self._generations)[1 - GENERATIONS_KEPT :], chance)
-        self._host.holdings.end_at_once()
-
-    def hear_granted(self, granted: Granted | Word, now_ns: int) -> None:
-        self._host.hear_granted(granted, now_ns)
+        generations = self.host.begin(sorted(self._generations)[1 - GENERATIONS_KEPT :], chance)
+        self.host.begin_as(self.host.generation, generations)  # which has ended, too: no vehicle drives by it
 
     def tick(self, now_ns: int) -> list[Tell]:
-        return [] if self.replaced else self._host.standings({}, now_ns)
+        return [] if self.host.replaced else self.host.standings({}, now_ns)

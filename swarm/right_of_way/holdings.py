@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from hashlib import blake2b
@@ -40,7 +40,6 @@ class Wish(msgspec.Struct, frozen=True):
 
 
 _NO_WISH = Wish()
-_NO_STANDS: Mapping[str, _Told] = {}
 
 
 def part_of(generation: int, grants: Mapping[str, Held], waits: Mapping[str, Sequence[Entry]]) -> int:
@@ -108,22 +107,23 @@ class _Said(msgspec.Struct, frozen=True):
 
 
 class Holdings:
-    """The host's side of right of way.
+    """The cells that the vehicles of one host hold, in one generation of it after the other (`Host`).
 
+    name      of the host: an agent, or an external vehicle
     vehicles  those of the host; None for all that bear its name
 
     keeps       cells ahead that a vehicle keeps though others wait for them
-    generation  which generation of the host this is; 0 before `begin`
-    shards      those that concern the host now: it speaks to their members and listens to their tables
+    generation  which generation of the host this is; 0 before `begin_as`
+    watched     shards that concern the host now: it speaks to their members and listens to their tables
     replaced    a later generation of this host has spoken: this one must end
     newest      the greatest generation of this host that a table in use names
     refused     sentences about impossible statements; the reader clears them
     """
 
-    def __init__(self, shards: Shards, agent: str, vehicles: Collection[str] | None) -> None:
-        self._shards = shards
+    def __init__(self, shards: Shards, name: str, vehicles: Collection[str] | None) -> None:
+        self.shards = shards
         self._shard_of = lru_cache(_MOST_CELLS)(shards.of)
-        self._agent = agent
+        self.name = name
         self.keeps = MOST_AHEAD
         self.refused: list[str] = []
         self._vehicles = None if vehicles is None else frozenset(vehicles)
@@ -133,9 +133,9 @@ class Holdings:
         """Resets to the state before the first generation: holds nothing and knows nothing."""
         self.generation = self.newest = 0
         self.replaced = False
-        self.shards: dict[int, None] = {}
+        self.watched: dict[int, None] = {}
         self._dead: list[int] = []
-        self._entries = HostEntries(0, self._shard_of, self._shards.adjacent)
+        self._entries = HostEntries(0, self._shard_of, self.shards.adjacent)
         self._paths: dict[str, list[int]] = {}
         """Vehicle that has a place -> the cells that it holds, in driving order; another list when they change."""
         self._pushed: dict[str, int] | None = None
@@ -143,21 +143,15 @@ class Holdings:
         self._said: dict[str, _Said] = {}
         self._seen_anew: set[str] = set()
         """Vehicles to which another table grants other cells: their requests may change."""
-        self._stands: dict[int, dict[str, _Told]] = {}
-        """Shard -> vehicle -> statement about it, in the order of `_paths`; follows `_said`."""
         self._views: dict[int, _View] = {}
         self._followed: set[Number] = set()
         """Entries of ours behind which others wait."""
         self._seq = 0
 
-    def begin(self, generation: int, dead: Sequence[int]) -> None:
+    def begin_as(self, generation: int, dead: Sequence[int]) -> None:
         """Begins a generation; `dead` are earlier ones that are proved to have ended."""
         self.generation = self._entries.generation = generation
         self._dead = list(dead)
-
-    def end_at_once(self) -> None:
-        """States that no vehicle drives by this generation: it only releases the cells of those before it."""
-        self._dead.append(self.generation)
 
     # --- what is held ---------------------------------------------------------------------------------------
 
@@ -184,19 +178,13 @@ class Holdings:
     def occupied(self) -> set[int]:
         """The cells that vehicles hold, of all to which one of ours at rest could go, as far as leaders tell."""
         occupied = set(chain.from_iterable(self._paths.values()))
-        for shard in self.shards:
+        for shard in self.watched:
             occupied |= self._views[shard].others
         return occupied
 
     def may_enter(self, vehicle: str, cell: int) -> bool:
         """Returns True if a vehicle may drive into a cell of its path now: those before it have left."""
-        path = self._entries.paths[vehicle]
-        for entry in path[1:]:
-            if not self._entries.may_enter(entry):
-                return False
-            if entry.cell == cell:
-                return True
-        return False
+        return cell in self.open(vehicle)[1:]
 
     def awaits(self, vehicle: str) -> Entry | None:
         """Returns the next entry of a vehicle while others are before it; None if it may enter, or has none."""
@@ -211,10 +199,10 @@ class Holdings:
 
     def open(self, vehicle: str) -> Sequence[int]:
         """The first cells of a path, up to the first that the vehicle may not enter yet."""
-        path = self.path(vehicle)
-        if not any(entry.after for entry in self._entries.paths.get(vehicle, ())):
+        path, entries = self.path(vehicle), self._entries.paths.get(vehicle, [])
+        if not any(entry.after for entry in entries):
             return path
-        return [*path[:1], *takewhile(lambda cell: self.may_enter(vehicle, cell), path[1:])]
+        return path[: 1 + sum(1 for _ in takewhile(self._entries.may_enter, entries[1:]))]
 
     @property
     def waits(self) -> bool:
@@ -243,7 +231,7 @@ class Holdings:
         generation of ours held it, it takes it, and releases all others. The newest call counts."""
         if vehicle not in self._paths:
             self._entries.enter(vehicle, cell)
-            self.watch([self._shards.of(cell)])
+            self.watch([self.shards.of(cell)])
 
     def leave(self, vehicle: str) -> None:
         """It stands nowhere any more: give back all that it holds."""
@@ -251,65 +239,56 @@ class Holdings:
         self._paths.pop(vehicle, None)
         said = self._said.pop(vehicle, None)
         for shard in () if said is None else said.stands:
-            del self._stands[shard][vehicle]
             self._views[shard].same = False
 
     @property
     def gone(self) -> bool:
         """True if no vehicle of ours holds or requests a cell, and all leaders that we contacted know it."""
-        return not (self.shards or self._entries.paths or self._entries.bodies)
-
-    @property
-    def answered(self) -> bool:
-        """Returns True if a table of each shard that concerns us takes this generation into account."""
-        return self.generation > 0 and not self.replaced and all(self._views[shard].heard for shard in self.shards)
+        return not (self.watched or self._entries.paths or self._entries.bodies)
 
     def is_granted(self, vehicle: str) -> bool:
         """Returns True if a table in use grants cells to a vehicle, which may have left them."""
         return any(vehicle in view.seen for view in self._views.values())
 
-    def waiting(self, shard: int) -> list[str]:
-        """The vehicles that have entries in a shard, as far as its table in use tells."""
-        return list(self._views[shard].seen) if shard in self._views else []
-
     def is_pending(self, shard: int) -> bool:
         """Returns True if a grant of a shard waits for words of its members."""
         return shard in self._views and bool(self._views[shard].pending)
-
-    def heard_ns(self, shard: int) -> int:
-        """Time when a shard's leader was heard last; 0 if none was."""
-        return self._views[shard].heard_ns if shard in self._views else 0
 
     # --- what leaders say -----------------------------------------------------------------------------------
 
     def watch(self, shards: Collection[int]) -> None:
         """Makes these shards concern us, until they are seen to hold nothing of ours."""
         for shard in shards:
-            self.shards.setdefault(shard)
+            self.watched.setdefault(shard)
             self._views.setdefault(shard, _View())
 
-    def hear_granted(self, granted: Granted, now_ns: int) -> list[str]:
-        """Acts on a leader's message to us, if it is newer than what we know. Returns the vehicles that have found
-        their place."""
-        view = self._views.setdefault(granted.shard, _View())
-        knows = self._entries.knows.get(granted.shard, BEFORE_ALL)
+    def hear_granted(self, granted: Granted | Word, now_ns: int) -> list[str]:
+        """Acts on a leader's grant, if it is newer than what we know, or on a member's word on one. Returns the
+        vehicles that have found their place."""
+        if not self.generation or granted.shard not in self.shards.all:
+            return []
+        if isinstance(granted, Word):
+            return self._hear_word(granted)
+        if granted.shard not in self.watched:
+            return []
+        view, knows = self._views[granted.shard], self._entries.knows.get(granted.shard, BEFORE_ALL)
         if granted.epoch > knows[0] + FURTHEST_EPOCH or granted.seq > _FURTHEST_SEQ:
             self.refused.append(f"{granted.agent} names a table that is implausibly far ahead: {granted.stamp}")
             return []
-        if granted.agent != self._shards.leader(granted.shard, granted.epoch) or granted.stamp < knows:
+        if granted.agent != self.shards.leader(granted.shard, granted.epoch) or granted.stamp < knows:
             return []
         view.leader, view.heard_ns = granted.agent, now_ns
-        if not self._shards.proven:
+        if not self.shards.proven:
             return self._take(view, granted)
         part = part_of(granted.generation, granted.grants, granted.waits)
         view.words[granted.agent] = granted.epoch, part
         view.pending[granted.agent] = granted, part
         return self._take_agreed(view)
 
-    def hear_word(self, word: Word) -> list[str]:
+    def _hear_word(self, word: Word) -> list[str]:
         """A member has something on file for us. Returns the vehicles that have found their place."""
         knows = self._entries.knows.get(word.shard, BEFORE_ALL)
-        if word.agent not in self._shards.members(word.shard) or word.epoch > knows[0] + FURTHEST_EPOCH:
+        if word.agent not in self.shards.members(word.shard) or word.epoch > knows[0] + FURTHEST_EPOCH:
             return []
         view = self._views.setdefault(word.shard, _View())
         view.words[word.agent] = word.epoch, word.part
@@ -327,7 +306,7 @@ class Holdings:
         """Acts on the grants that a majority has on file."""
         placed: list[str] = []
         for leader, (granted, part) in sorted(view.pending.items(), key=lambda each: each[1][0].stamp):
-            if list(view.words.values()).count((granted.epoch, part)) >= self._shards.majority:
+            if list(view.words.values()).count((granted.epoch, part)) >= self.shards.majority:
                 del view.pending[leader]
                 placed += self._take(view, granted)
         return placed
@@ -372,15 +351,15 @@ class Holdings:
 
     def hear_left(self, left: Left) -> list[str]:
         """Another host says what its vehicles have left. Returns the vehicles that have found their place."""
+        if left.host != self.name or not self.generation or self.replaced:
+            return []
         self._entries.hear_left(left.agent, left.entries)
         return self._place()
 
     def _place(self) -> list[str]:
         """Puts vehicles that are nowhere on the first cell of their paths, where they may."""
         entries = self._entries
-        for vehicle in entries.paths.keys() - self._paths.keys():
-            entries.place(vehicle)
-        placed = [vehicle for vehicle in entries.paths if vehicle in entries.placed and vehicle not in self._paths]
+        placed = [vehicle for vehicle in entries.paths if vehicle not in self._paths and entries.place(vehicle)]
         for vehicle in placed:
             entries.bodies.pop(vehicle, None)
             self._set_path(vehicle)
@@ -391,15 +370,18 @@ class Holdings:
     def standings(self, wishes: Mapping[str, Wish], now_ns: int) -> list[Tell]:
         """Returns the statements for each shard that concerns us, if they are new or the last one is a heartbeat
         old. Cells that a statement omits are released."""
+        if not self.generation:
+            return []
         self._seq += 1
-        self._say_changed(wishes)
-        by_shard = {shard: self._stands.get(shard, _NO_STANDS) for shard in self.shards}
-        by_shard.update((shard, stands) for shard, stands in self._stands.items() if stands)
+        by_shard: dict[int, dict[str, _Told]] = {shard: {} for shard in self.watched}
+        for vehicle, stands in self._say_changed(wishes):
+            for shard, told in stands.items():
+                by_shard.setdefault(shard, {})[vehicle] = told
         entries = self._entries
         for vehicle, cell in entries.bodies.items():
             if vehicle not in entries.paths:
                 self._say_entering(
-                    by_shard, self._shards.of(cell), Stand(vehicle, cell, cell, Held(), [cell], [], 0, 0)
+                    by_shard, self.shards.of(cell), Stand(vehicle, cell, cell, Held(), [cell], [], 0, 0)
                 )
         for vehicle, path in entries.paths.items():
             if vehicle not in self._paths:
@@ -413,51 +395,45 @@ class Holdings:
             if self._is_news(shard, stands, now_ns)
         ]
 
-    def _say_entering(self, by_shard: dict[int, Mapping[str, _Told]], shard: int, stand: Stand) -> None:
+    def _say_entering(self, by_shard: dict[int, dict[str, _Told]], shard: int, stand: Stand) -> None:
         """States what a vehicle that is nowhere has and wants of a shard."""
-        by_shard[shard] = {**by_shard.get(shard, _NO_STANDS), stand.vehicle: (stand, stand)}
+        by_shard.setdefault(shard, {})[stand.vehicle] = stand, stand
         self._views.setdefault(shard, _View()).same = False
 
     def lefts(self, now_ns: int) -> list[Left]:
-        """Returns the words of ours for which vehicles of other hosts wait, if they are new or a heartbeat old."""
+        """Returns the words of ours for which vehicles of other hosts wait, if they are new or a heartbeat old. A
+        replaced generation says none."""
         words: dict[str, list[Number]] = {}
-        for shard, view in self._views.items():
+        for shard, view in () if self.replaced else self._views.items():
             over = self._entries.over.get(shard, set())
             for host, numbers in view.followed.items():
-                if host == self._agent:
+                if host == self.name:
                     continue
                 told, told_ns = view.left.get(host, (None, 0))
                 left = [number for number in numbers if number in over]
                 if left and not is_said(left, told, now_ns - told_ns):
                     view.left[host] = left, now_ns
                     words.setdefault(host, []).extend(left)
-        return [Left(agent=self._agent, host=host, entries=numbers) for host, numbers in words.items()]
+        return [Left(agent=self.name, host=host, entries=numbers) for host, numbers in words.items()]
 
-    def _say_changed(self, wishes: Mapping[str, Wish]) -> None:
-        """Rebuilds the statements about vehicles of which path, wish or granted cells have changed."""
-        anew, known, moved = self._seen_anew, self._said, False
+    def _say_changed(self, wishes: Mapping[str, Wish]) -> Iterator[tuple[str, Mapping[int, _Told]]]:
+        """Yields the statements about each vehicle that has a place. Those of a vehicle are made again if its path,
+        wish or granted cells have changed."""
+        anew, self._seen_anew = self._seen_anew, set()
         for vehicle, path in self._paths.items():
-            before, wish = known.get(vehicle), wishes.get(vehicle, _NO_WISH)
+            before, wish = self._said.get(vehicle), wishes.get(vehicle, _NO_WISH)
             if (
-                before is not None
-                and before.wish is wish
-                and (before.path is path or self._is_no_news(before, path))
-                and not (anew and vehicle in anew)
+                before is None
+                or before.wish is not wish
+                or not (before.path is path or self._is_no_news(before, path))
+                or vehicle in anew
             ):
-                continue
-            said = known[vehicle] = self._say(vehicle, path, wish)
-            moved = moved or before is None or before.stands.keys() != said.stands.keys()
-            for shard, told in said.stands.items():
-                self._views.setdefault(shard, _View()).same = False
-                if not moved:
-                    self._stands[shard][vehicle] = told
-        anew.clear()
-        if moved:
-            self._say_all_again()
-            self._stands = {}
-            for vehicle in self._paths:
-                for shard, told in known[vehicle].stands.items():
-                    self._stands.setdefault(shard, {})[vehicle] = told
+                said = self._said[vehicle] = self._say(vehicle, path, wish)
+                for shard in said.stands:
+                    self._views.setdefault(shard, _View()).same = False
+                if before is None or before.stands.keys() != said.stands.keys():
+                    self._say_all_again()
+            yield vehicle, self._said[vehicle].stands
 
     def _is_no_news(self, said: _Said, path: list[int]) -> bool:
         """Returns True if a vehicle has only driven on, out of cells for which none waits, and has as many ahead as
@@ -474,7 +450,7 @@ class Holdings:
     def _standing(self, shard: int, stands: list[Stand]) -> HostState:
         return HostState(
             shard=shard,
-            agent=self._agent,
+            agent=self.name,
             generation=self.generation,
             seq=self._seq,
             knows=self._entries.knows.get(shard, BEFORE_ALL),
@@ -486,9 +462,9 @@ class Holdings:
 
     def _listeners(self, shard: int, now_ns: int) -> tuple[str, ...]:
         view = self._views[shard]
-        if not self._shards.proven and view.leader and 0 <= now_ns - view.heard_ns < _UNHEARD_NS:
+        if not self.shards.proven and view.leader and 0 <= now_ns - view.heard_ns < _UNHEARD_NS:
             return (view.leader,)
-        return self._shards.members(shard)
+        return self.shards.members(shard)
 
     def _is_news(self, shard: int, stands: Mapping[str, _Told], now_ns: int) -> bool:
         view = self._views[shard]
@@ -531,7 +507,7 @@ class Holdings:
                 view.quiet = None
             elif view.quiet is None:
                 view.quiet = self._seq
-        self.shards = {
+        self.watched = {
             shard: None
             for shard in by_shard
             if (quiet := self._views[shard].quiet) is None

@@ -141,11 +141,10 @@ class HostEntries:
         return all((entry.cell, epoch, seq) in ours for epoch, seq, _ in entry.after)
 
     def place(self, vehicle: str) -> bool:
-        """Puts a vehicle that is nowhere on the first cell of its path, if it may."""
-        if vehicle in self.placed or not self.may_enter(self.paths[vehicle][0]):
-            return False
-        self.placed.add(vehicle)
-        return True
+        """Puts a vehicle that is nowhere on the first cell of its path, if it may. Returns whether it is there."""
+        if self.may_enter(self.paths[vehicle][0]):
+            self.placed.add(vehicle)
+        return vehicle in self.placed
 
     def enter_next(self, vehicle: str) -> bool:
         """Drives a vehicle over the border into the next cell of its path, if it may. Its own cell is left then."""

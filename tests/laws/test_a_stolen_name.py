@@ -56,7 +56,7 @@ def harm_done(seed: int, *, renewed: bool = False) -> list[str]:
         world.run(0.07)
     ghosts = [id for each in world.files() for id in each.grants if id not in world.goals]
     ghosts += [str(fence) for each in world.files() for fence in each.fences if fence.agent != world.stolen]
-    hosts = [(process.vehicles, process.rights.holdings._entries.paths) for process in world.processes]
+    hosts = [(process.vehicles, process.rights.host._entries.paths) for process in world.processes]
     ghosts += [f"{id} is nowhere" for vehicles, paths in hosts for id in vehicles if id not in paths]
     return [*map(str, world.collisions), *(f"shard {shard} does not agree" for shard in at_odds), *ghosts]
 
@@ -78,7 +78,7 @@ def test_members_agree_once_the_name_is_revoked_although_all_vehicles_have_left(
     for process in world.processes:
         process.disk.bodies.clear()
         for vehicle in process.vehicles:
-            process.rights.holdings.leave(vehicle)
+            process.rights.host.leave(vehicle)
     world.unmoved.clear()
     world.run(4.0)
     world.revoke()
@@ -102,9 +102,9 @@ def hosts_believe_one_leader(patch: pytest.MonkeyPatch) -> None:
     hear = Holdings.hear_granted
 
     def gullible(self: Holdings, granted, now_ns):  # type: ignore[no-untyped-def]
-        majority, self._shards.majority = self._shards.majority, 1
+        majority, self.shards.majority = self.shards.majority, 1
         placed = hear(self, granted, now_ns)
-        self._shards.majority = majority
+        self.shards.majority = majority
         return placed
 
     patch.setattr(Holdings, "hear_granted", gullible)
@@ -213,10 +213,10 @@ def test_a_host_disclaims_nothing_while_a_vehicle_is_nowhere() -> None:
     """A liar may ask before the grant of the entry by which it begins: it would not take that."""
     holdings = holdings_of()
     word = Word(shard=0, host="a0", agent=MEMBERS[0], epoch=3, seq=9, part=0, asks=True, lacks=[(7, 3, 2)])
-    holdings.hear_word(word)
+    holdings.hear_granted(word, 0)
     assert not holdings._entries.never(0)
     holdings.enter("a0-00", 9)
-    holdings.hear_word(word)
+    holdings.hear_granted(word, 0)
     assert holdings._entries.never(0) == {(7, 3, 2)}
 
 

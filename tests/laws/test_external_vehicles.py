@@ -91,7 +91,7 @@ def test_cells_of_an_external_vehicle_that_is_gone_are_free_again(seed: int) -> 
 def first_cells_are_entered_while_others_are_there(patch: pytest.MonkeyPatch) -> None:
     may = Leader._may_follow
     patch.setattr(Leader, "_may_follow", lambda self, stand, order: not stand.holds or may(self, stand, order))
-    patch.setattr(HostEntries, "place", lambda self, vehicle: self.placed.add(vehicle))
+    patch.setattr(HostEntries, "place", lambda self, vehicle: not self.placed.add(vehicle))
 
 
 def a_silent_external_loses_its_cells(patch: pytest.MonkeyPatch) -> None:
@@ -109,13 +109,13 @@ def a_silent_external_loses_its_cells(patch: pytest.MonkeyPatch) -> None:
 
 def a_robot_that_is_replaced_says_that_it_has_ended(patch: pytest.MonkeyPatch) -> None:
     def talkative(self: ExternalVehicle, now_ns: int):  # type: ignore[no-untyped-def]
-        actions = self._host.standings({}, now_ns)
-        self._host.ended_alone(now_ns)
+        actions = self.host.standings({}, now_ns)
+        self.host.ended_alone(now_ns)
         return actions
 
     tick = ExternalVehicle.tick
     patch.setattr(
-        ExternalVehicle, "tick", lambda self, now_ns: (talkative if self.replaced else tick)(self, now_ns)
+        ExternalVehicle, "tick", lambda self, now_ns: (talkative if self.host.replaced else tick)(self, now_ns)
     )
 
 
@@ -123,9 +123,7 @@ def a_robot_drives_on_though_it_is_replaced(patch: pytest.MonkeyPatch) -> None:
     hear = Host.hear_granted
 
     def unfenced(self: Host, granted, now_ns):  # type: ignore[no-untyped-def]
-        self.holdings.generation = self.holdings._entries.generation = max(
-            self.holdings.generation, granted.generation
-        )
+        self.generation = self._entries.generation = max(self.generation, granted.generation)
         return hear(self, granted, now_ns)
 
     patch.setattr(Host, "hear_granted", unfenced)

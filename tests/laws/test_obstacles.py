@@ -198,7 +198,8 @@ SHARDS = Shards(GRID, ["a0"])
 def agent_at(cells: list[int]) -> Agent:
     plan = plan_agents(SCENARIO)[0]
     holdings = Holdings(SHARDS, plan.id, plan.vehicle_ids)
-    holdings.begin(1, [])
+    holdings.begin_as(1, [])
+    holdings.watch([0])
     local = LocalMap(GRID, LEVEL, LEVEL, LEVEL, LEVEL)
     agent = Agent(plan, SCENARIO, local, TruthSensor(GRID, LEVEL, 20.0), holdings, Obstacles(GRID, MARGIN_M))
     grant(agent, 1, dict(zip(plan.vehicle_ids, ([cell] for cell in cells), strict=True)))

@@ -67,7 +67,7 @@ def check(world: TrafficWorld, settle_s: float = 8.0, move_s: float = 10.0) -> N
 def assert_remembers_what_is_not_over(process: Process) -> None:
     """A host remembers entries which are over while a table lists them, and a bounded number of words of others; a
     leader remembers what its table says."""
-    entries = process.rights.holdings._entries
+    entries = process.rights.host._entries
     for shard, over in entries.over.items():
         assert over <= {*chain(*entries.listed.get(shard, {}).values())}
     assert len(entries.heard) <= host_entries._MOST_HEARD
@@ -327,7 +327,7 @@ def seats_a_file_that_is_not_the_first(patch: pytest.MonkeyPatch) -> None:
 
     def bold(self: RightOfWay, chance: int):  # type: ignore[no-untyped-def]
         actions = begin(self, chance)
-        self.own = msgspec.structs.replace(self.own, noted_by=[name for name in self._spawns if name != self.agent])
+        self.own = msgspec.structs.replace(self.own, noted_by=[name for name in self.spawns if name != self.agent])
         return actions
 
     patch.setattr(RightOfWay, "begin", bold)
@@ -339,7 +339,7 @@ def acts_on_a_table_that_is_not_the_newest(patch: pytest.MonkeyPatch) -> None:
     def absent_minded(self: Holdings, wishes, now_ns):  # type: ignore[no-untyped-def]
         said = standings(self, wishes, now_ns)
         for known in (self._views, self._entries.knows, self._entries.over):
-            for shard in [shard for shard in known if shard not in self.shards]:
+            for shard in [shard for shard in known if shard not in self.watched]:
                 del known[shard]
         return said
 

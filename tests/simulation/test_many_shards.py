@@ -16,7 +16,7 @@ def test_agents_listen_to_the_shards_near_their_vehicles_and_keep_every_law():
     simulation = Simulation(seeded(1, WIDE))
     laws = LawBook(simulation)
     simulation.run_until(6)
-    shards = [len(service._right_of_way.core.holdings.shards) for service in agents(simulation).values()]
+    shards = [len(service._right_of_way.core.host.watched) for service in agents(simulation).values()]
     assert len(shards) == 8
     assert sum(shards) < 48  # of 64
     simulation.run_until(15.0)
@@ -46,7 +46,7 @@ def test_nobody_meets_where_shards_are_larger_than_regions(seed):
     assert min(messages.values()) > 0
     cores = [service._right_of_way.core for service in agents(simulation).values()]
     assert {core.shards.count for core in cores} == {2}  # 280 x 800 cells
-    assert {shard for core in cores for shard in core.holdings.shards} <= set(cores[0].shards.all)
+    assert {shard for core in cores for shard in core.host.watched} <= set(cores[0].shards.all)
 
 
 def test_agents_that_begin_while_they_are_cut_off_find_all_their_vehicles_afterwards():

@@ -18,7 +18,7 @@ from swarm.config.scenario import RoverConfig, Scenario
 from swarm.wire.messages.traffic import Entry, Held, Number, Table
 from vehicle_agent.driving.driven_vehicle import Vehicle
 from vehicle_agent.traffic.cell_orders import Orders
-from vehicle_agent.traffic.cell_requests import CellRequests
+from vehicle_agent.traffic.next_cells import CellRequests
 from vehicle_agent.traffic.shard_leader import Leader
 
 ROVERS = (
@@ -129,8 +129,8 @@ def test_leaders_plan_for_those_who_ask_and_tell_what_a_plan_for_all_would(name,
     def content_twice(leader: Leader, table: Table) -> dict[str, Any]:
         nonlocal told
         contents = content_of(leader, table)
-        for host, content in contents.items():
-            assert (*content[:2], content[4]) == told_anew(leader, table, host)
+        for host, (granted, _) in contents.items():
+            assert (granted.grants, granted.waits, granted.occupied) == told_anew(leader, table, host)
             told += 1
         return contents
 

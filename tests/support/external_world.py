@@ -25,7 +25,7 @@ class ExternalProcess(Process):
 
     def __init__(self, world: ExternalWorld, agent: str, disk: Disk) -> None:
         super().__init__(world, agent, disk)
-        self.hear_token = self.external.hear_token
+        self.hear_token = self.external.host.hear_token
 
     def make_rights(self) -> RightOfWay:
         self.external = ExternalVehicle(self.world.shards, self.agent, self.disk.own.generations)
@@ -45,7 +45,7 @@ class ExternalProcess(Process):
         return []
 
     def hear_known(self, known: Known) -> None:
-        self.external.hear_known(known)
+        self.external.host.hear_known(known)
 
     def begin(self) -> None:
         if not self.external.needs_generation:
@@ -68,12 +68,12 @@ class ExternalProcess(Process):
                     self.perform([action])
 
     def hear_granted(self, granted: Granted) -> None:
-        self.enter_if(self.external.hear_granted(granted, self.now_ns))
+        self.enter_if(self.external.host.hear_granted(granted, self.now_ns))
 
     def hear_left(self, left: Left) -> None:
-        self.enter_if(self.external.hear_left(left))
+        self.enter_if(self.external.host.hear_left(left))
 
-    def enter_if(self, entered: bool) -> None:
+    def enter_if(self, entered: list[str]) -> None:
         if entered:
             if self.body is None:
                 self.world.entered += 1
@@ -136,7 +136,7 @@ class AddedProcess(Process):
         return rights
 
     def tick(self) -> None:
-        world, holdings = self.world, self.rights.holdings
+        world, holdings = self.world, self.rights.host
         self.vehicles = world.added[self.agent]
         for vehicle in self.vehicles if holdings.generation and not holdings.replaced else ():
             asked_ns = self.asked_ns.setdefault(vehicle, world.now_ns)
@@ -165,7 +165,7 @@ class OperatorProcess(Process):
 
     @property
     def settled(self) -> bool:
-        return self.removal.settled
+        return self.removal.host.informed
 
     def ask_known(self, request: KnownRequest) -> list[Action]:
         return []
@@ -177,11 +177,11 @@ class OperatorProcess(Process):
         self.removal.begin(self.world.chance.getrandbits(32))
 
     def hear_granted(self, granted: Granted) -> None:
-        self.removal.hear_granted(granted, self.now_ns)
+        self.removal.host.hear_granted(granted, self.now_ns)
 
     def tick(self) -> None:
         self.perform([*self.removal.tick(self.now_ns)])
-        if self.removal.done or self.removal.replaced:
+        if self.removal.done or self.removal.host.replaced:
             self.alive = False
             self.world.processes.remove(self)
             self.world.removed += self.removal.done

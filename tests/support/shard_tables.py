@@ -53,7 +53,7 @@ def standing(
 
 def holdings_of() -> Holdings:
     holdings = Holdings(SHARDS, "a0", ["a0-00"])
-    holdings.begin(1, [])
+    holdings.begin_as(1, [])
     holdings.watch([0])
     return holdings
 

@@ -285,8 +285,8 @@ class ThiefWorld(TrafficWorld):
         """True if all honest members of a shard had one table on file lately, and all honest hosts with vehicles
         there know one of its epoch: they have the words of a majority."""
         seats = [seats[shard] for process in self.processes if shard in (seats := process.rights._members)]
-        hosts = [process.rights.holdings for process in self.processes]
-        epochs = {host._entries.knows.get(shard, (0, 0))[0] for host in hosts if shard in host.shards}
+        hosts = [process.rights.host for process in self.processes]
+        epochs = {host._entries.knows.get(shard, (0, 0))[0] for host in hosts if shard in host.watched}
         same = [base for stamp, base in seats[0]._bases.items() if all(s._bases.get(stamp) == base for s in seats)]
         return any(epochs <= {table.epoch} for table in same)
 

@@ -115,7 +115,7 @@ class Process:
                 del self.disk.bodies[vehicle]  # it has been driven from elsewhere since
         self.perform(self.rights.begin(self.world.chance.getrandbits(32)))
         for vehicle, cell in self.disk.bodies.items():
-            self.rights.holdings.enter(vehicle, cell)
+            self.rights.host.enter(vehicle, cell)
 
     def perform(self, actions: list[Action]) -> None:
         for action in actions:
@@ -164,7 +164,7 @@ class Process:
 
     def place(self, placed: list[str]) -> None:
         for vehicle in placed:
-            self.disk.bodies[vehicle] = self.rights.holdings.path(vehicle)[0]
+            self.disk.bodies[vehicle] = self.rights.host.path(vehicle)[0]
             self.world.driver[vehicle] = self.disk
             self.world.unmoved.pop(vehicle, None)
             self.world.placed += 1
@@ -174,7 +174,7 @@ class Process:
         return self.rights.answer_known(request)
 
     def tick(self) -> None:
-        holdings = self.rights.holdings
+        holdings = self.rights.host
         self.own_time.tick(self.world.now_ns + self.offset_ns)
         self.see_tokens()
         wishes = {}
@@ -199,7 +199,7 @@ class Process:
         self.tokens = up
 
     def drive(self, vehicle: str) -> None:
-        holdings, chance = self.rights.holdings, self.world.chance
+        holdings, chance = self.rights.host, self.world.chance
         awaits = holdings.awaits(vehicle)
         entry, since_ns = self.waits.get(vehicle, (None, 0))
         if awaits != entry:
@@ -218,7 +218,7 @@ class Process:
 
     def wish(self, vehicle: str) -> Wish:
         world = self.world
-        path = holdings_path = self.rights.holdings.path(vehicle)
+        path = holdings_path = self.rights.host.path(vehicle)
         goal = world.goals[vehicle]
         if path[0] == goal:
             goal = world.new_goal(vehicle)
@@ -230,10 +230,10 @@ class Process:
             at = min(world.next_to(at), key=cost.__getitem__)
             ahead.append(at)
         here = path[0]
-        held = self.rights.holdings.occupied()
+        held = self.rights.host.occupied()
         wants = sorted(world.next_to(here), key=lambda cell: (cost[cell] + 0.9 * (cell in held), cell))[:8]
         better = sum(cost[cell] < cost[here] for cell in wants)
-        pushed = self.rights.holdings.pushed.get(vehicle, 0)
+        pushed = self.rights.host.pushed.get(vehicle, 0)
         if pushed:
             better = len(wants)
         return Wish(ahead, wants, better, max(self.ages[vehicle], pushed))

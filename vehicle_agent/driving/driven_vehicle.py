@@ -14,8 +14,9 @@ from numpy.typing import NDArray
 
 from swarm.clock import NS_PER_S
 from swarm.grid import REGION_CELLS, GridSpec, bounds_of
-from swarm.wire.messages.vehicles import VehicleState
-from swarm.wire.route_columns import RouteStatus
+from swarm.wire.fields import pack_column
+from swarm.wire.messages.vehicles import Followed, VehicleState
+from swarm.wire.route_columns import RouteStatus, directions_of
 from vehicle_agent.driving.motion import CELL, HEADING_RAD, Motion, places_m, rows_of
 
 _NOWHERE = (9, 9, 0, 0)
@@ -169,6 +170,8 @@ PREFETCH_CELLS = 8
 PLACES = "place:"
 """Before a cell, in the name of a place as a target; no id of a target has a colon. Alone: the planner of all
 places."""
+_PLACE = "place"
+"""The target of a route to a place, for those who watch."""
 
 
 def goal_name(cell: int) -> str:
@@ -222,21 +225,6 @@ class GivenRoute(msgspec.Struct, frozen=True):
     turns: tuple[int, ...] = ()
 
 
-class Follow(msgspec.Struct, frozen=True):
-    """A vehicle has begun a route, from the cell on which it stands.
-
-    legs  of a pulled route over how many steps each of its segments goes
-    """
-
-    vehicle: str
-    target: str
-    cells: tuple[int, ...]
-    cost_s: float
-    lower_bound_s: float
-    searching: bool = False
-    legs: tuple[int, ...] = ()
-
-
 # --- the core -----------------------------------------------------------------------------------------------
 
 
@@ -256,6 +244,7 @@ class Vehicle:
 
     def __init__(self, id: str, grid: GridSpec, cell: int) -> None:
         self.id = id
+        self._cols = grid.cols
         self.state = VehicleState.IDLE
         self.target: str | None = None
         self.goal: int | None = None
@@ -368,8 +357,9 @@ class Vehicle:
         goes = self.target is not None and self.goal is None and not self.in_reach and self._need is None
         return goes and self.state is not VehicleState.STRANDED and self.route.left > PREFETCH_CELLS
 
-    def give_route(self, given: GivenRoute, path: Sequence[int], now_ns: int) -> Follow | None:
-        """Begins the route, if it leads to the target and passes a cell of the vehicle's path."""
+    def give_route(self, given: GivenRoute, path: Sequence[int], now_ns: int) -> Followed | None:
+        """Begins the route, if it leads to the target and passes a cell of the vehicle's path. Returns what to tell
+        of it."""
         if not given.pushed:
             self.asked = None
         begun = None
@@ -413,7 +403,7 @@ class Vehicle:
 
     # --- inside ---------------------------------------------------------------------------------------------
 
-    def _begin(self, given: GivenRoute, path: Sequence[int]) -> Follow:
+    def _begin(self, given: GivenRoute, path: Sequence[int]) -> Followed:
         self._need = None
         self._retry_ns = _RETRY_NS
         self.searching = given.searching
@@ -424,8 +414,14 @@ class Vehicle:
         driven = (*before, start, *self.route.ahead())
         legs = self.route.legs_ahead()
         legs = [1] * (len(before) * bool(legs)) + legs
-        return Follow(
-            self.id, given.target, driven, given.cost_s, given.lower_bound_s, given.searching, tuple(legs)
+        return Followed(
+            vehicle=self.id,
+            target=given.target if self.goal is None else _PLACE,
+            start=driven[0],
+            directions=directions_of(driven, self._cols),
+            cost_s=given.cost_s,
+            lower_bound_s=given.lower_bound_s,
+            legs=pack_column(legs, "<u4"),
         )
 
     def _need_route(self, reason: Reason, now_ns: int) -> None:

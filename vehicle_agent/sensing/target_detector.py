@@ -19,31 +19,34 @@ _TELL_NS = NS_PER_S // 2
 """Period of the sightings of a target that stays in sight."""
 _RANGE_SHARE = 0.02
 """The uncertainty of a sighting is half a cell and this share of the distance."""
-SIGHTING_LASTS_S = 30.0
-"""A sighting expires after this many seconds: by then a target may be anywhere within some hundred metres."""
+SIGHTING_LASTS_NS = 30 * NS_PER_S
+"""A sighting expires after this time: by then a target may be anywhere within some hundred metres."""
 _IN_SIGHT_NS = 2 * _TELL_NS
 _RETELL_NS = NS_PER_S
 """A planner that appears hears sightings after this time."""
 
 
 class TargetDetector:
-    """The simulated sensor for targets: knows where all are, and reports those within its range.
+    """The simulated sensor for targets: knows where all are, and reports those within its range. A target that no
+    tracker reports is where the best sighting of it says.
 
     For each target it remembers the last sighting of all, if it was its own, for a planner that restarts and
     received none. A target that was captured in sight is somewhere else, and its sighting is forgotten.
 
-    range_m  of the sensor
-    lasts_s  a sighting expires after this time
+    range_m    of the sensor
+    reading    whose sightings count
+    untracked  targets that no tracker reports
     """
 
     def __init__(
-        self, grid: GridSpec, author: str, group: str, range_m: float, lasts_s: float = SIGHTING_LASTS_S
+        self, grid: GridSpec, author: str, group: str, range_m: float, reading: MarkFilter, untracked: Set[str]
     ) -> None:
+        self.untracked = untracked
+        self._sightings = Sightings(reading)
         self._grid = grid
         self._author = author
         self._group = group
         self._range_m = range_m
-        self._lasts_ns = int(lasts_s * NS_PER_S)
         self._true: dict[str, TargetPose] = {}
         self._newest = Newest(silence_ns=POSE_SILENCE_NS)
         self._told_ns: dict[str, int] = {}
@@ -63,16 +66,23 @@ class TargetDetector:
             if jumped and last is not None and now_ns - last.stamp_ns <= _IN_SIGHT_NS:
                 del self._last[pose.target]
 
-    def lose(self, targets: Iterable[str]) -> None:
-        """Forgets the positions of these targets."""
-        for target in targets:
+    def lose(self, targets: Set[str], now_ns: int) -> None:
+        """Forgets the positions of these targets, if they have trackers, and expired sightings. A vehicle goes on
+        to where it last knew its target to be."""
+        self._sightings.expire(now_ns)
+        for target in targets - self.untracked:
             self._true.pop(target, None)
 
-    def note_sighting(self, sighted: Sighted) -> None:
-        """Another author saw a target."""
+    def note_sighting(self, sighted: Sighted, now_ns: int) -> TargetPose | None:
+        """A vehicle of any author saw a target. Returns the pose of the target if it has no tracker; None if that
+        is no news."""
         last = self._last.get(sighted.target)
         if last is not None and sighted.author != self._author and sighted.stamp_ns > last.stamp_ns:
             del self._last[sighted.target]
+        if sighted.target not in self.untracked or not self._sightings.receive(sighted, now_ns):
+            return None
+        best = self._sightings.best(now_ns).get(sighted.target)  # None if the sighting came after it expired
+        return None if best is None else pose_of(best)
 
     def retell(self, target: str, now_ns: int) -> None:
         """Repeats the last sighting for a planner that has restarted."""
@@ -109,35 +119,13 @@ class TargetDetector:
             target=pose.target,
             seq=self._seq,
             stamp_ns=now_ns,
-            until_ns=now_ns + self._lasts_ns,
+            until_ns=now_ns + SIGHTING_LASTS_NS,
             cell=pose.cell,
             x_m=pose.x_m,
             y_m=pose.y_m,
             uncertainty_m=0.5 * self._grid.resolution_m + _RANGE_SHARE * distance_m,
         )
         return self._last[pose.target]
-
-
-class UntrackedTargets:
-    """The targets that no tracker reports: each is where the best sighting of it says.
-
-    reading  whose sightings count
-    """
-
-    def __init__(self, targets: Set[str], reading: MarkFilter) -> None:
-        self.targets = targets
-        self._sightings = Sightings(reading)
-
-    def receive(self, sighted: Sighted, now_ns: int) -> TargetPose | None:
-        """The pose of an untracked target after one more sighting; None if that is no news of one."""
-        if sighted.target not in self.targets or not self._sightings.receive(sighted, now_ns):
-            return None
-        best = self._sightings.best(now_ns).get(sighted.target)  # None if the sighting came after it expired
-        return None if best is None else pose_of(best)
-
-    def expire(self, now_ns: int) -> None:
-        """Forgets expired sightings. A vehicle goes on to where it last knew its target to be."""
-        self._sightings.expire(now_ns)
 
 
 # Places where a target was seen last and is not any more, as vehicles find that stand there. Pure.

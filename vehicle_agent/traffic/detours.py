@@ -9,6 +9,7 @@ from __future__ import annotations
 import heapq
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,6 +32,7 @@ _RARELY_NS = 16 * NS_PER_S
 _DIAGONAL = math.sqrt(2.0)
 
 
+@dataclass
 class Detours:
     """Leads vehicles around standing obstacles.
 
@@ -41,28 +43,23 @@ class Detours:
     found  how many ways around were begun
     """
 
-    def __init__(
-        self,
-        grid: GridSpec,
-        pace: NDArray[np.float32],
-        steps: Callable[[int], list[int]],
-        obstacles: Obstacles,
-        climb: Climb | None = None,
-    ) -> None:
-        self.found = 0
-        self._climb = climb
-        self._grid = grid
-        self._pace = pace.reshape(-1)
-        self._steps = steps
-        self._obstacles = obstacles
-        self._searches: dict[str, tuple[int, Iterator[list[int] | None]]] = {}
-        """Vehicle -> the search under way for it, and the route for which it was begun."""
-        self._waits: dict[str, tuple[int, int]] = {}
-        """Vehicle without a path around -> when it is tried again, and the pause before that."""
+    grid: GridSpec
+    pace: NDArray[np.float32]
+    steps: Callable[[int], list[int]]
+    obstacles: Obstacles
+    climb: Climb | None = None
+    found: int = 0
+    _searches: dict[str, tuple[int, Iterator[list[int] | None]]] = field(default_factory=dict)
+    """Vehicle -> the search under way for it, and the route for which it was begun."""
+    _waits: dict[str, tuple[int, int]] = field(default_factory=dict)
+    """Vehicle without a path around -> when it is tried again, and the pause before that."""
+
+    def __post_init__(self) -> None:
+        self._pace = self.pace.reshape(-1)
 
     def tick(self, vehicles: Iterable[Vehicle], path: Callable[[str], Sequence[int]], now_ns: int) -> None:
         """Begins and continues searches; vehicles for which one has ended follow what it has found."""
-        standing = self._obstacles.standing if self._obstacles.any else ()
+        standing = self.obstacles.standing if self.obstacles.any else ()
         if not standing:
             self._searches.clear()
             self._waits.clear()
@@ -114,18 +111,18 @@ class Detours:
         behind = route[first : first + _LOOK_CELLS]
         rest_s, goals = 0.0, {}
         for index in range(len(behind) - 1, -1, -1):
-            if behind[index] not in self._obstacles.closed:
+            if behind[index] not in self.obstacles.closed:
                 goals[behind[index]] = (rest_s, first + index)
             if index:
                 rest_s += self._step_s(behind[index - 1], behind[index])
         if not goals:
             return
-        lowest = 1.0 if self._climb is None else self._climb.lowest
-        least = float(self._pace[behind].min()) * self._grid.resolution_m * lowest
-        end_row, end_col = divmod(behind[-1], self._grid.cols)
+        lowest = 1.0 if self.climb is None else self.climb.lowest
+        least = float(self._pace[behind].min()) * self.grid.resolution_m * lowest
+        end_row, end_col = divmod(behind[-1], self.grid.cols)
 
         def bound_s(cell: int) -> float:
-            row, col = divmod(cell, self._grid.cols)
+            row, col = divmod(cell, self.grid.cols)
             south, east = abs(row - end_row), abs(col - end_col)
             return least * (max(south, east) + (_DIAGONAL - 1.0) * min(south, east))
 
@@ -140,7 +137,7 @@ class Detours:
             here_s = cost_s[cell]
             if cell in goals and here_s + goals[cell][0] < best_s:
                 best_s, best = here_s + goals[cell][0], cell
-            for to in self._steps(cell):
+            for to in self.steps(cell):
                 there_s = here_s + self._step_s(cell, to)
                 if there_s < cost_s.get(to, math.inf):
                     cost_s[to], before[to] = there_s, cell
@@ -154,6 +151,6 @@ class Detours:
         yield [*way[::-1], *route[goals[best][1] + 1 :]]
 
     def _step_s(self, tail: int, head: int) -> float:
-        straight = abs(head - tail) in (1, self._grid.cols)
-        level_s = float(self._pace[head]) * self._grid.resolution_m * (1.0 if straight else _DIAGONAL)
-        return level_s if self._climb is None else level_s * self._climb.of_step(tail, head)
+        straight = abs(head - tail) in (1, self.grid.cols)
+        level_s = float(self._pace[head]) * self.grid.resolution_m * (1.0 if straight else _DIAGONAL)
+        return level_s if self.climb is None else level_s * self.climb.of_step(tail, head)

@@ -1,10 +1,12 @@
-"""Next cells of each vehicle: a host's requests to leaders for it."""
+"""Next cells of each vehicle: a host's requests to leaders for it, and which of them it keeps."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Container, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
 from itertools import pairwise
+from zlib import crc32
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,10 +14,12 @@ from numpy.typing import NDArray
 from shared_map.terrain.step_climb import Climb
 from swarm.clock import NS_PER_S
 from swarm.config.scenario import PlannerConfig
-from swarm.grid import GridSpec
-from swarm.right_of_way.holdings import Wish
+from swarm.grid import GridSpec, Window
+from swarm.right_of_way.holdings import Holdings, Wish
+from vehicle_agent.agent_maps import meet
 from vehicle_agent.driving.driven_vehicle import Vehicle
 from vehicle_agent.obstacles import Obstacles
+from vehicle_agent.traffic.cell_orders import cells_beside
 
 _NEAR_CELLS = 8
 """Cells of the route to which a vehicle that was pushed off it may return."""
@@ -39,6 +43,7 @@ _OLDEST_MS = 1 << 31
 """Above the age of any wish, and within a column of uint32."""
 
 
+@dataclass
 class Steering:
     """Ranks the cells around vehicles by their routes.
 
@@ -55,26 +60,19 @@ class Steering:
     ways_out     cell that only an operator's zone closes -> steps from there out of it: a vehicle there leaves
     """
 
-    def __init__(
-        self,
-        grid: GridSpec,
-        pace: NDArray[np.float32],
-        planner: PlannerConfig,
-        reserve: int,
-        obstacles: Obstacles,
-        climb: Climb | None = None,
-    ) -> None:
-        self._grid = grid
-        self._climb = climb
-        self._pace = pace.reshape(-1)
-        self._diagonal = planner.neighbours == 8
-        self._corner_cutting = planner.corner_cutting
-        self._reserve = reserve
-        self._obstacles = obstacles
-        self._shut = obstacles.closed
-        self.ways_out: Mapping[int, int] = {}
-        self.waiting_ns: dict[str, tuple[int, int]] = {}
-        self.shut_in: set[str] = set()
+    grid: GridSpec
+    pace: NDArray[np.float32]
+    planner: PlannerConfig
+    reserve: int
+    obstacles: Obstacles
+    climb: Climb | None = None
+    ways_out: Mapping[int, int] = field(default_factory=dict)
+    waiting_ns: dict[str, tuple[int, int]] = field(default_factory=dict)
+    shut_in: set[str] = field(default_factory=set)
+
+    def __post_init__(self) -> None:
+        self._pace, self._shut = self.pace.reshape(-1), self.obstacles.closed
+        self._diagonal = self.planner.neighbours == 8
 
     def closed(self, cell: int) -> bool:
         """Returns True if a cell is lethal, or an obstacle closes it."""
@@ -85,15 +83,15 @@ class Steering:
         it."""
         if tail in self.ways_out:
             return head in self._out_of(tail)
-        if self.closed(head) or not (self._climb is None or self._climb.allows(tail, head)):
+        if self.closed(head) or not (self.climb is None or self.climb.allows(tail, head)):
             return False
         return not self._cuts_corner(tail, head)
 
     def _cuts_corner(self, tail: int, head: int) -> bool:
         """Returns True if a step to a neighbour is a diagonal that the cells beside it, or the planner, forbid."""
-        cols = self._grid.cols
+        cols = self.grid.cols
         rows, col = head // cols - tail // cols, head % cols - tail % cols
-        if not rows or not col or (self._diagonal and self._corner_cutting):
+        if not rows or not col or (self._diagonal and self.planner.corner_cutting):
             return False
         return not self._diagonal or self.closed(tail + col) or self.closed(tail + rows * cols)
 
@@ -105,16 +103,16 @@ class Steering:
         at = np.array(cells, np.int64)
         tails, heads = at[:-1], at[1:]
         lethal = np.isinf(self._pace[heads])
-        if not self._corner_cutting:
-            cols = at % self._grid.cols
+        if not self.planner.corner_cutting:
+            cols = at % self.grid.cols
             east = cols[1:] - cols[:-1]
             # Beside a straight step are its own two cells. Leaving a lethal cell matters to diagonals only; for all
             # steps but the first it is the head of the previous one, which ends the route there anyway.
             beside = np.isinf(self._pace[tails + east]) | np.isinf(self._pace[heads - east])
-            beside[0] &= cols[0] != cols[1] and cells[0] // self._grid.cols != cells[1] // self._grid.cols
+            beside[0] &= cols[0] != cols[1] and cells[0] // self.grid.cols != cells[1] // self.grid.cols
             lethal |= beside
-        if self._climb is not None:
-            lethal |= np.isinf(self._climb.along(tails, heads))
+        if self.climb is not None:
+            lethal |= np.isinf(self.climb.along(tails, heads))
         first = int(lethal.argmax())
         return first if lethal[first] else len(cells) - 1
 
@@ -150,7 +148,7 @@ class Steering:
             wants = sorted(
                 steps,
                 key=lambda cell: (
-                    self._obstacles.danger(cell) if flees else 0.0,
+                    self.obstacles.danger(cell) if flees else 0.0,
                     self._is_one_way(here, cell),
                     not in_reach(vehicle.target, cell),
                     cell in held,
@@ -169,7 +167,7 @@ class Steering:
         if self.threatened(here):
             wants = sorted(
                 cost,
-                key=lambda cell: (self._obstacles.danger(cell), cell in one_way, cost[cell], hash((lot, cell))),
+                key=lambda cell: (self.obstacles.danger(cell), cell in one_way, cost[cell], hash((lot, cell))),
             )
             return Wish(ahead, wants, len(wants), _OLDEST_MS)
         if ahead and ahead[0] in cost and ahead[0] not in one_way:
@@ -183,7 +181,7 @@ class Steering:
     def threatened(self, cell: int) -> bool:
         """Returns True if an obstacle is on a cell or approaches it: a vehicle there makes way before all
         others."""
-        return self._obstacles.any and (cell in self._shut or self._obstacles.danger(cell) > 0.0)
+        return self.obstacles.any and (cell in self._shut or self.obstacles.danger(cell) > 0.0)
 
     def forget(self, vehicle: str) -> None:
         """It does not wait any more."""
@@ -207,11 +205,11 @@ class Steering:
 
     def _is_shut_in(self, cell: int) -> bool:
         """Returns True if no step leads from a cell, and obstacles close a cell beside it."""
-        return not self.steps(cell) and any(each in self._shut for _, each in self._grid.neighbours(cell))
+        return not self.steps(cell) and any(each in self._shut for _, each in self.grid.neighbours(cell))
 
     def _ahead(self, vehicle: Vehicle, path: Sequence[int]) -> list[int]:
         """The next cells of the route after what it holds; none if that ends beside the route."""
-        asks = len(path) <= max(FAR_CELLS + 1, self._reserve)
+        asks = len(path) <= max(FAR_CELLS + 1, self.reserve)
         ahead = vehicle.route.after(path[-1], FAR_CELLS) if asks else []
         for index, (tail, head) in enumerate(pairwise((path[-1], *ahead))):
             if not self.passable(tail, head):
@@ -221,7 +219,7 @@ class Steering:
     def _out_of(self, cell: int) -> list[int]:
         """The neighbours straight beside a cell in a zone that are nearer to its border, or open."""
         depth = self.ways_out[cell]
-        beside = [neighbour for direction, neighbour in self._grid.neighbours(cell) if direction % 2 == 0]
+        beside = [neighbour for direction, neighbour in self.grid.neighbours(cell) if direction % 2 == 0]
         outwards = [each for each in beside if not self.closed(each) or self.ways_out.get(each, depth) < depth]
         return [each for each in outwards if each not in self._shut]
 
@@ -229,13 +227,13 @@ class Steering:
         """The neighbours that the map allows to drive to."""
         if cell in self.ways_out:
             return self._out_of(cell)
-        around = [each for direction, each in self._grid.neighbours(cell) if self._diagonal or direction % 2 == 0]
+        around = [each for direction, each in self.grid.neighbours(cell) if self._diagonal or direction % 2 == 0]
         return [each for each in around if self.passable(cell, each)]
 
     def _is_one_way(self, tail: int, head: int) -> bool:
         """Returns True if a step between neighbours could not be reversed, as it is too steep the other way: it may
         lead into a dead end."""
-        return self._climb is not None and not self._climb.allows(head, tail)
+        return self.climb is not None and not self.climb.allows(head, tail)
 
     def _costs(
         self, here: int, stays: float, route: Sequence[tuple[int, int, int, float]]
@@ -246,7 +244,7 @@ class Steering:
         it that could not be reversed are for vehicles that must make way only.
         """
         cost = {cell: self._cost(cell, route) for cell in self.steps(here)}
-        if self._climb is None:
+        if self.climb is None:
             return cost, ()
         cells = [cell for cell, *_ in route]
         if here in cells:
@@ -257,7 +255,7 @@ class Steering:
     def _places(self, route: Sequence[int]) -> list[tuple[int, int, int, float]]:
         """(cell, row, column, cells of the route from there on) of each cell of a route."""
         length = len(route)
-        return [(cell, *divmod(cell, self._grid.cols), float(length - index)) for index, cell in enumerate(route)]
+        return [(cell, *divmod(cell, self.grid.cols), float(length - index)) for index, cell in enumerate(route)]
 
     def _cost(self, cell: int, route: Sequence[tuple[int, int, int, float]]) -> float:
         """Cost-to-go of a cell by the route near it, in cells: back onto the route in one step, then along it.
@@ -265,16 +263,140 @@ class Steering:
         With direction-dependent costs a route winds, beside cells of its own to which a step is too steep or too
         expensive. Then a cell of it costs its remainder, so that the next one is always better than to stay.
         """
-        row, col = divmod(cell, self._grid.cols)
+        row, col = divmod(cell, self.grid.cols)
         best = math.inf
         for there, there_row, there_col, rest in route:
-            if self._climb is not None and there == cell:
+            if self.climb is not None and there == cell:
                 return rest
             south, east = abs(row - there_row), abs(col - there_col)
             apart = south + _DIAGONAL * east if south > east else east + _DIAGONAL * south
-            beside = apart < 2.0 and (self._climb is None or self._climb.allows(cell, there))
+            beside = apart < 2.0 and (self.climb is None or self.climb.allows(cell, there))
             beside = beside and not self._cuts_corner(cell, there)
             cost = rest + apart if beside else rest + _OFF_ROUTE + 2.0 * apart
             if cost < best:
                 best = cost
         return best
+
+
+_TURN_NS = 4 * NS_PER_S
+"""A vehicle's wish does not age for this time: then its age grows by a step, in which leaders compare ages.
+Each vehicle's turns begin at another time, so that no tick has all wishes to make
+(docs/design/zenoh-topology-and-inboxes.md)."""
+_WAITING_TURN_NS = NS_PER_S
+"""The same for one that waits on its way: ties between cells fall another way more often."""
+_MS = NS_PER_S // 1000
+"""Unit: ages are sent in milliseconds, clocks count nanoseconds."""
+_STAYS = Wish()
+
+
+@dataclass
+class CellRequests:
+    """Makes the wishes of vehicles, and keeps each until one of its inputs changes.
+
+    `Steering.wish` is a function of its arguments, of the cells near the vehicle (ground, obstacles, and cells held
+    by others) and of nothing else, so a kept wish equals a new one. Its inputs are compared in one place, `make`:
+    arguments are compared, and each kind of cell reports its changed cells.
+
+    near_cells   how far from a vehicle the ground may lie on which its wish depends
+    target_cell  the cell of a target, None where it is unknown
+    in_reach     whether a target is within capture range of a cell
+    seed         decides ties
+
+    of  vehicle -> its wish, as of the last call of `make` or `stay`; the same object while it says the same
+    """
+
+    steering: Steering
+    holdings: Holdings
+    near_cells: int
+    target_cell: Callable[[str | None], int | None]
+    in_reach: Callable[[str | None, int], bool]
+    seed: str
+    of: dict[str, Wish] = field(default_factory=dict)
+    _made_of: dict[str, tuple[tuple[object, ...], int, int]] = field(default_factory=dict)
+    """Vehicle -> what its wish was made of, but for the cells near it; and from when until when that is so as far
+    as time has a part in it."""
+    _beside: dict[str, frozenset[int]] = field(default_factory=dict)
+    """Vehicle at rest -> the cells that matter if another vehicle holds them."""
+    _changed: list[Window] = field(default_factory=list)
+    """Cells whose ground has changed since wishes were made."""
+    _held: set[int] = field(default_factory=set)
+    """The cells that vehicles held when wishes were made."""
+    _since_ns: dict[str, int] = field(default_factory=dict)
+    """Vehicle -> since when it has been on its way."""
+
+    def forget(self, vehicle: str) -> None:
+        """It is not driven any more."""
+        for known in (self.of, self._made_of, self._beside, self._since_ns):
+            known.pop(vehicle, None)
+        self.steering.forget(vehicle)
+
+    def ground_changed(self, windows: Iterable[Window]) -> None:
+        """The ground has changed in these windows."""
+        self._changed += windows
+
+    def make_anew(self) -> None:
+        """Keeps nothing: at the next call of `make` all are made."""
+        self._made_of.clear()
+
+    def stay(self, vehicle: str) -> None:
+        """It is to stand where it is."""
+        self.of[vehicle] = _STAYS
+        self._made_of.pop(vehicle, None)
+
+    def is_kept(self, vehicle: str, now_ns: int) -> bool:
+        """Returns True if the wish of a vehicle that is under way is good still, as far as ground, obstacles and
+        time have a part in it."""
+        kept = self._made_of.get(vehicle)
+        return kept is not None and kept[1] <= now_ns < kept[2]
+
+    def make(self, vehicles: Sequence[Vehicle], now_ns: int) -> None:
+        """Makes the wishes of these vehicles for which anything has changed. Called once in a tick, after all
+        changes of held cells, and after `look_around`. The wishes of others are as they were."""
+        holdings, steering = self.holdings, self.steering
+        held = holdings.occupied()
+        changed = held ^ self._held
+        self._held = held
+        ways_out, known, beside = steering.ways_out, self._made_of, self._beside
+        paths, pushed, since_all_ns = holdings.paths, holdings.pushed, self._since_ns
+        for vehicle in vehicles:
+            id, target, near = vehicle.id, vehicle.target, vehicle.in_reach
+            path = paths[id]
+            still = len(path) == 1
+            place = self.target_cell(target) if near else None
+            pushed_ms = pushed.get(id, 0)
+            made_of = path, vehicle.route.version, target, near, place, pushed_ms
+            kept = known.get(id)
+            same = kept is not None and kept[0] == made_of and kept[1] <= now_ns < kept[2]
+            if same and (not still or changed.isdisjoint(beside[id])):
+                continue
+            idle = (near or target is None) and path[0] not in ways_out
+            turn_ns = _WAITING_TURN_NS if still and not idle else _TURN_NS
+            phase_ns = crc32(id.encode()) % 4000 * (_TURN_NS // 4000)
+            turn = (now_ns + phase_ns) // turn_ns
+            since_ns = None
+            if not idle:
+                since_ns = since_all_ns.setdefault(id, now_ns)
+            elif id in since_all_ns:
+                del since_all_ns[id]
+            began_ns = turn * turn_ns - phase_ns
+            known[id] = made_of, began_ns, began_ns + turn_ns
+            lot = 0
+            if still:
+                beside[id] = cells_beside(path[0], self.steering.grid.cols)
+                lot = crc32(f"{self.seed}/{id}/{turn}".encode())
+            age_ms = 0 if since_ns is None else max(began_ns - since_ns, 0) // _MS
+            wish = steering.wish(vehicle, path, pushed_ms, age_ms, held, self.in_reach, lot)
+            if wish != self.of.get(id):
+                self.of[id] = wish
+
+    def look_around(self, vehicles: Sequence[Vehicle]) -> None:
+        """Keeps no wish of a vehicle near which the ground has changed, or what obstacles close and threaten."""
+        changed = [*self._changed, *self.steering.obstacles.take_changed()]
+        self._changed = []
+        if not (changed and vehicles):
+            return
+        cells = np.fromiter((vehicle.cell for vehicle in vehicles), np.int64, len(vehicles))
+        near, (row, col) = self.near_cells, np.divmod(cells, self.steering.grid.cols)
+        places = np.stack((row - near, col - near, row + near, col + near), 1)
+        for index in np.flatnonzero(meet(places, changed)).tolist():
+            self._made_of.pop(vehicles[index].id, None)

@@ -10,7 +10,7 @@ that wait: each would wait for itself.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 _DEEPEST = 200
 """Vehicles that one can push at once: within the interpreter's depth of recursion."""
@@ -32,6 +32,7 @@ class Mover:
     outside: bool = False
 
 
+@dataclass
 class Round:
     """One round of planning in one shard.
 
@@ -45,21 +46,17 @@ class Round:
     pushed  vehicle -> the age of the one that it could not make way for within the shard
     """
 
-    def __init__(
-        self,
-        movers: Sequence[Mover],
-        closed: Callable[[int], bool],
-        inside: Callable[[int], bool],
-        onward: Callable[[int], Iterable[int]] = lambda cell: (),
-    ) -> None:
-        self.to: dict[str, int] = {}
-        self.taken: dict[int, str] = {}
-        self.pushed: dict[str, int] = {}
-        self._standing = {mover.cell: mover for mover in movers if not mover.outside}
-        self._closed = closed
-        self._inside = inside
-        self._onward = onward
-        self._chain: set[int] = set()
+    movers: Sequence[Mover]
+    closed: Callable[[int], bool]
+    inside: Callable[[int], bool]
+    onward: Callable[[int], Iterable[int]] = lambda cell: ()
+    to: dict[str, int] = field(default_factory=dict)
+    taken: dict[int, str] = field(default_factory=dict)
+    pushed: dict[str, int] = field(default_factory=dict)
+    _chain: set[int] = field(default_factory=set)
+
+    def __post_init__(self) -> None:
+        self._standing = {mover.cell: mover for mover in self.movers if not mover.outside}
 
     def plan(self, mover: Mover, *, pushed: bool = False) -> None:
         """Plans a mover and those in its way, if it is not planned yet.
@@ -79,7 +76,7 @@ class Round:
         self.to[mover.id] = mover.cell
         if not mover.outside:
             self.taken[mover.cell] = mover.id
-        if pushed and any(not self._inside(cell) for cell in mover.wants):
+        if pushed and any(not self.inside(cell) for cell in mover.wants):
             self.pushed[mover.id] = age
         return not pushed
 
@@ -87,11 +84,11 @@ class Round:
         for rank, cell in enumerate(mover.wants):
             if rank >= mover.better and not pushed:
                 return False
-            if not self._inside(cell):
+            if not self.inside(cell):
                 if pushed or mover.outside:
                     continue
                 return False  # it waits for the other shard's leader
-            if cell in self.taken or cell in self._chain or self._closed(cell):
+            if cell in self.taken or cell in self._chain or self.closed(cell):
                 continue
             other = self._standing.get(cell)
             if (other is not None and len(self._chain) >= _DEEPEST) or self._comes_back(cell):
@@ -110,7 +107,7 @@ class Round:
             if at in self._chain:
                 return True
             mover = self._standing.get(at)
-            further = self._onward(at) if mover is None else (self.to.get(mover.id, at),)
+            further = self.onward(at) if mover is None else (self.to.get(mover.id, at),)
             for each in further:
                 if each not in seen:
                     seen.add(each)

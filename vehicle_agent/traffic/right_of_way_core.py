@@ -8,6 +8,7 @@ later messages are sent.
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
+from dataclasses import dataclass, field
 
 import msgspec
 from msgspec.structs import replace
@@ -46,6 +47,7 @@ class OwnRecord(msgspec.Struct, frozen=True, kw_only=True, rename=_ON_DISK):
 Action = MemberAction | Tell | Left | OwnRecord | Known | AskKnown
 
 
+@dataclass
 class RightOfWay:
     """Right of way of one agent.
 
@@ -56,45 +58,37 @@ class RightOfWay:
               by one
     tick_ns   between two ticks
 
-    host      our part as a host of vehicles
-    holdings  which cells our vehicles hold: none before `begin`
-    trips     round trips to the other agents
-    silent    whether our file cannot be written now: then we are no member of any shard, and note no other agent's
-              file. Our vehicles' held and granted cells do not depend on it
+    host    our part as a host of vehicles
+    trips   round trips to the other agents
+    silent  whether our file cannot be written now: then we are no member of any shard, and note no other agent's
+            file. Our vehicles' held and granted cells do not depend on it
 
     Raises StoreError if the file holds promises of shards of another size: the same cells would be granted twice.
     """
 
-    def __init__(
-        self,
-        agent: str,
-        shards: Shards,
-        spawns: Mapping[str, Mapping[str, int]],
-        own: OwnRecord,
-        saved: Mapping[int, tuple[int, Table]],
-        vehicles: Collection[str] = (),
-        tick_ns: int = NS_PER_S // 10,
-    ) -> None:
-        self.agent = agent
-        self.trips = RoundTrips()
-        self._tick_ns = tick_ns
-        self.shards = shards
-        if not (saved or own.noted or own.noted_by):  # no vehicle depends on it: it takes any size
-            own = replace(own, shard_cells=shards.side)
-        elif own.shard_cells != shards.side:
+    agent: str
+    shards: Shards
+    spawns: Mapping[str, Mapping[str, int]]
+    own: OwnRecord
+    saved: Mapping[int, tuple[int, Table]]
+    vehicles: Collection[str] = ()
+    tick_ns: int = NS_PER_S // 10
+    trips: RoundTrips = field(default_factory=RoundTrips)
+    silent: bool = False
+    _members: dict[int, Member] = field(default_factory=dict)
+    _revoked: dict[str, int] = field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        own, side, self.saved = self.own, self.shards.side, dict(self.saved)
+        if not (self.saved or own.noted or own.noted_by):  # no vehicle depends on it: it takes any size
+            self.own = replace(own, shard_cells=side)
+        elif own.shard_cells != side:
             raise StoreError(
-                f"agent {agent} has on file promises of shards of {own.shard_cells} cells, the scenario has "
-                f"{shards.side}: set map.shard_regions to {own.shard_cells // REGION_CELLS}, or start another run"
+                f"agent {self.agent} has on file promises of shards of {own.shard_cells} cells, the scenario has "
+                f"{side}: set map.shard_regions to {own.shard_cells // REGION_CELLS}, or start another run"
             )
-        self.own = own
-        self._is_external = agent not in spawns
-        self.host = Host(shards, agent, vehicles if self._is_external else spawns[agent])
-        self.holdings = self.host.holdings
-        self._spawns = spawns
-        self._saved = dict(saved)
-        self._members: dict[int, Member] = {}
-        self.silent = False
-        self._revoked: dict[str, int] = {}
+        self._is_external = self.agent not in self.spawns
+        self.host = Host(self.shards, self.agent, self.vehicles if self._is_external else self.spawns[self.agent])
 
     # --- beginning a generation -----------------------------------------------------------------------------------
 
@@ -107,8 +101,8 @@ class RightOfWay:
         A generation may begin before others could answer, as beside a router that restarts. Without a later query
         it would never speak to the leaders of shards of which we are no member, and its vehicles there would have
         no place."""
-        noted = self._is_external or len(self.own.noted_by) >= len(self._spawns) - 1
-        return self.holdings.generation > 0 and self.host.informed and noted and not self.holdings.replaced
+        noted = self._is_external or len(self.own.noted_by) >= len(self.spawns) - 1
+        return self.host.generation > 0 and self.host.informed and noted and not self.host.replaced
 
     def answer_known(self, request: KnownRequest) -> list[Action]:
         """Another agent has begun a generation. The last action is what to answer.
@@ -120,7 +114,7 @@ class RightOfWay:
             return []
         if request.agent == self.agent or self.silent or self._is_external:
             return []
-        if request.agent not in self._spawns or not request.disk:
+        if request.agent not in self.spawns or not request.disk:
             if not self._has_quorum:
                 return []
             known = self._known_of(request.agent, request.disk)
@@ -137,9 +131,9 @@ class RightOfWay:
 
     def hear_known(self, known: Known) -> list[Action]:
         """An answer to our question."""
-        if known.agent not in self._spawns or known.agent == self.agent or known.shard_cells != self.shards.side:
+        if known.agent not in self.spawns or known.agent == self.agent or known.shard_cells != self.shards.side:
             return []
-        self.host.hear_known(known.agent, known.generation, known.shards)
+        self.host.hear_known(known)
         if self.silent or self._is_external or known.disk != self.own.disk or known.agent in self.own.noted_by:
             return []
         self.own = replace(self.own, noted_by=[*self.own.noted_by, known.agent])
@@ -150,10 +144,10 @@ class RightOfWay:
 
         chance  a random number
         """
-        self.host.hear_known(self.agent, *self._known(self.agent))
+        self.host.hear_known(self._known_of(self.agent, self.own.disk))
         generations = self.host.begin(self.own.generations, chance)
-        home = map(self.shards.of, self._spawns.get(self.agent, {}).values())
-        self.holdings.watch([shard for shard in home if shard in self.shards.all])
+        home = map(self.shards.of, self.spawns.get(self.agent, {}).values())
+        self.host.watch([shard for shard in home if shard in self.shards.all])
         self.own = replace(self.own, generations=generations)
         return [self.own]
 
@@ -163,26 +157,26 @@ class RightOfWay:
         return self.shards.has_quorum({self.agent, *self.own.noted_by})
 
     def _known_of(self, agent: str, disk: int) -> Known:
-        generation, shards = self._known(agent)
-        return Known(
-            agent=self.agent, disk=disk, generation=generation, shards=shards, shard_cells=self.shards.side
-        )
-
-    def _known(self, agent: str) -> tuple[int, list[int]]:
-        """The greatest generation of an agent in any stored table, and the shards that grant cells to its vehicles
-        or keep some of an earlier generation shut."""
+        """Content of stored tables about an agent: its greatest generation in any, and the shards that grant cells
+        to its vehicles or keep some of an earlier generation shut."""
         stored = self._stored()
-        generation = max((table.hosts.get(agent, (0, 0))[0] for table in stored.values()), default=0)
-        return generation, sorted(
+        shards = (
             shard
             for shard, table in stored.items()
             if any(agent_of(vehicle) == agent for vehicle in table.grants)
             or any(fence.agent == agent for fence in table.fences)
         )
+        return Known(
+            agent=self.agent,
+            disk=disk,
+            generation=max((table.hosts.get(agent, (0, 0))[0] for table in stored.values()), default=0),
+            shards=sorted(shards),
+            shard_cells=self.shards.side,
+        )
 
     def _stored(self) -> dict[int, Table]:
         """Shard -> the newest table of it on our file."""
-        stored = {shard: table for shard, (_, table) in self._saved.items()}
+        stored = {shard: table for shard, (_, table) in self.saved.items()}
         stored.update((shard, member.stored) for shard, member in self._members.items())
         return stored
 
@@ -229,14 +223,14 @@ class RightOfWay:
 
     def tick(self, wishes: Mapping[str, Wish], now_ns: int) -> list[Action]:
         """Returns the messages of our members and our vehicles to send now."""
-        actions: list[Action] = [Refused(text) for text in self.holdings.refused]
-        self.holdings.refused.clear()
-        for shard in self._saved if self._revoked else ():
+        actions: list[Action] = [Refused(text) for text in self.host.refused]
+        self.host.refused.clear()
+        for shard in self.saved if self._revoked else ():
             self._member(shard, now_ns)  # they have to agree again, even if no host speaks to them
         for member in () if self.silent else self._members.values():
             actions += member.tick(now_ns)
-        if self.holdings.replaced:
-            self.holdings.watch(self._known(self.agent)[1])
+        if self.host.replaced:
+            self.host.watch(self._known_of(self.agent, self.own.disk).shards)
         actions += self.host.lefts(now_ns)
         actions += self.host.standings(wishes, now_ns)
         if self.host.ended_alone(now_ns):
@@ -257,9 +251,9 @@ class RightOfWay:
         honest = {*members} - self._revoked.keys()
         if self.agent not in members or not noted.issuperset(honest) or not self._has_quorum:
             return None
-        promised, stored = self._saved.get(shard) or (0, self._at_start(shard))
+        promised, stored = self.saved.get(shard) or (0, self._at_start(shard))
         made = self._members[shard] = Member(
-            self.shards, self.agent, promised, stored, self._spawns, now_ns, self.trips, self._tick_ns
+            self.shards, self.agent, promised, stored, self.spawns, now_ns, self.trips, self.tick_ns
         )
         made.revoke(self._revoked, now_ns)
         return made
@@ -268,7 +262,7 @@ class RightOfWay:
         """The table from before any leader: vehicles stand where the run begins."""
         grants = {
             vehicle: Held.of([(cell, 0, 1)])
-            for fleet in self._spawns.values()
+            for fleet in self.spawns.values()
             for vehicle, cell in fleet.items()
             if self.shards.of(cell) == shard
         }

@@ -14,12 +14,14 @@ from functools import lru_cache
 from itertools import chain
 from zlib import crc32
 
+from msgspec.structs import replace
+
 from swarm.clock import NS_PER_S
 from swarm.config.agent_plan import agent_of
 from swarm.right_of_way.generations import HEARTBEAT_NS, is_far_ahead, is_said
 from swarm.right_of_way.host import GENERATIONS_KEPT
 from swarm.right_of_way.shards import Shards
-from swarm.wire.messages.traffic import Entry, Granted, Held, HostState, Number, Stamp, Stand, Table
+from swarm.wire.messages.traffic import Granted, HostState, Number, Stamp, Stand, Table
 from vehicle_agent.traffic.cell_orders import Orders, cells_beside
 from vehicle_agent.traffic.pibt import Mover, Round
 
@@ -82,13 +84,6 @@ def _rests(stand: Stand, entries: Sequence[Number]) -> bool:
     return stand.cell == stand.end and (not entries or (len(entries) == 1 and entries[0][0] == stand.cell))
 
 
-_Content = tuple[
-    dict[str, Held], dict[str, list[Entry]], dict[str, list[Number]], dict[str, int], list[int], int, int
-]
-"""Content of a `Granted`: entries, those that wait, those that are followed, vehicles to make way, and cells of
-others; then its generation, and what it was heard to say if it waits for that alone."""
-
-
 @dataclass(slots=True)
 class _Host:
     """Known state of a host.
@@ -148,8 +143,8 @@ class Leader:
         self._changed = False  # or anything else
         self._told: Table | None = None
         self._told_ns = 0
-        self._content: dict[Stamp, dict[str, _Content]] = {}
-        """Stamp of a table -> host -> what it is told of that."""
+        self._content: dict[Stamp, dict[str, tuple[Granted, Granted]]] = {}
+        """Stamp of a table -> as `_content_of` it."""
         self._said_of: Stamp | None = None
         self._said_ns = 0
 
@@ -253,16 +248,25 @@ class Leader:
         if is_said(table.stamp, self._said_of, now_ns - self._said_ns, _TOLD_AGAIN_NS):
             return
         self._said_of, self._said_ns = table.stamp, now_ns
-        for name, content in self._content.get(table.stamp, {}).items():
+        for name, (granted, news) in self._content.get(table.stamp, {}).items():
             host = self._hosts[name]
-            if now_ns - host.spoke_ns > SILENT_NS:
-                continue
+            silent = now_ns - host.spoke_ns > SILENT_NS
+            if not silent and not is_said(news, host.told, now_ns - host.told_ns, _TOLD_AGAIN_NS):
+                host.told, host.told_ns = news, now_ns
+                yield granted
+
+    def _content_of(self, table: Table) -> dict[str, tuple[Granted, Granted]]:
+        """Returns host -> its part of the table that has just been made, and the same without what is no news: the
+        number of the table and, while the host has vehicles, which statement of it was heard."""
+        orders, cols, followed = self._orders, self._shards.grid.cols, self._orders.followed()
+        found: dict[str, tuple[Granted, Granted]] = {}
+        for name, host in self._hosts.items():
+            grants, waits = orders.granted(name)
+            # Also around those under way: their requests once they come to rest depend on the cells around.
+            stands = () if host.standing is None else host.standing.vehicles
+            near = set[int]().union(*(cells_beside(stand.end, cols) for stand in stands))
             generation, heard = table.hosts.get(name, (0, 0))
-            if is_said(content, host.told, now_ns - host.told_ns, _TOLD_AGAIN_NS):
-                continue
-            host.told, host.told_ns = content, now_ns
-            grants, waits, behind, pushed, occupied, *_ = content
-            yield Granted(
+            granted = Granted(
                 shard=table.shard,
                 host=name,
                 agent=table.agent,
@@ -272,25 +276,11 @@ class Leader:
                 heard=heard,
                 grants=grants,
                 waits=waits,
-                followed=behind,
-                pushed=pushed,
-                occupied=occupied,
+                followed=followed.get(name, {}),
+                pushed={vehicle: age for vehicle, age in table.pushed.items() if vehicle in grants},
+                occupied=sorted(cell for cell in near & orders.orders.keys() if not orders.has(cell, grants)),
             )
-
-    def _content_of(self, table: Table) -> dict[str, _Content]:
-        """Returns host -> what is new to it in the table that has just been made."""
-        orders, cols, followed = self._orders, self._shards.grid.cols, self._orders.followed()
-        found: dict[str, _Content] = {}
-        for name, host in self._hosts.items():
-            grants, waits = orders.granted(name)
-            # Also around those under way: their requests once they come to rest depend on the cells around.
-            stands = () if host.standing is None else host.standing.vehicles
-            near = set[int]().union(*(cells_beside(stand.end, cols) for stand in stands))
-            occupied = sorted(cell for cell in near & orders.orders.keys() if not orders.has(cell, grants))
-            pushed = {vehicle: age for vehicle, age in table.pushed.items() if vehicle in grants}
-            generation, heard = table.hosts.get(name, (0, 0))
-            behind, awaited = followed.get(name, {}), 0 if stands else heard
-            found[name] = grants, waits, behind, pushed, occupied, generation, awaited
+            found[name] = granted, replace(granted, epoch=0, seq=0, heard=0 if stands else heard)
         return found
 
     def _plan(self, now_ns: int) -> None:

@@ -15,7 +15,7 @@ from swarm.liveness import POSE_SILENCE_NS
 from swarm.wire.messages.planning import Sighted, TargetPose
 from swarm.wire.topics import SIGHTED
 from vehicle_agent.driving.driven_vehicle import Places, Vehicle
-from vehicle_agent.sensing.target_detector import TargetDetector
+from vehicle_agent.sensing.target_detector import SIGHTING_LASTS_NS, TargetDetector
 
 GRID = GridSpec(40, 40, 10.0, west_m=1000.0, north_m=5000.0)
 
@@ -90,19 +90,19 @@ def test_of_a_group_that_is_not_read_nothing_is_known() -> None:
 
 
 def test_a_vehicle_tells_of_targets_in_range_and_how_sure_it_is() -> None:
-    detector = TargetDetector(GRID, "red.a0.1", "red", range_m=100.0, lasts_s=2.0)
+    detector = TargetDetector(GRID, "red.a0.1", "red", 100.0, MarkFilter(GRID), set())
     x_m, y_m = GRID.centre_m(GRID.cell(10, 10))
     detector.set_truth(TargetPose(target="t", incarnation=1, seq=1, stamp_ns=0, cell=410, x_m=x_m, y_m=y_m), 0)
     far, near = Vehicle("u", GRID, GRID.cell(10, 30)), Vehicle("v", GRID, GRID.cell(10, 15))
     assert detector.detect(Places(GRID, [far]), 0) == []
     (told,) = detector.detect(Places(GRID, [far, near]), 0)
-    assert (told.cell, told.until_ns, told.uncertainty_m) == (410, 2_000_000_000, 5.0 + 0.02 * 50.0)
+    assert (told.cell, told.until_ns, told.uncertainty_m) == (410, SIGHTING_LASTS_NS, 5.0 + 0.02 * 50.0)
     assert detector.detect(Places(GRID, [near]), 400_000_000) == []  # not so often
     assert len(detector.detect(Places(GRID, [near]), 500_000_000)) == 1
 
 
 def test_a_planner_that_begins_anew_is_told_the_last_sighting_by_whoever_had_it_unless_it_was_a_capture() -> None:
-    detector = TargetDetector(GRID, "red.a0.1", "red", range_m=100.0)
+    detector = TargetDetector(GRID, "red.a0.1", "red", 100.0, MarkFilter(GRID), set())
     near = Places(GRID, [Vehicle("v", GRID, GRID.cell(10, 15))])
 
     def stand(cell: int, seq: int, at_s: int, jumps: int = 0) -> None:
@@ -121,7 +121,7 @@ def test_a_planner_that_begins_anew_is_told_the_last_sighting_by_whoever_had_it_
     stand(0, 2, 10)
     assert retold(60) == told
     assert detector.retold(99 * NS_PER_S) == [], "once"
-    detector.note_sighting(sighted(3 * NS_PER_S, author="red.a1.1"))
+    detector.note_sighting(sighted(3 * NS_PER_S, author="red.a1.1"), 3 * NS_PER_S)
     assert retold(100) == [], "another knows better"
     stand(GRID.cell(10, 10), 3, 110)
     assert detector.detect(near, 110 * NS_PER_S)

@@ -46,7 +46,7 @@ def talk(external: ExternalVehicle, leader: Leader, now_ns: int = 0) -> None:
     table = leader.tick(now_ns)
     if table is not None:
         for granted in leader.granted(table, now_ns):
-            external.hear_granted(granted, now_ns)
+            external.host.hear_granted(granted, now_ns)
 
 
 def test_it_enters_drives_on_what_it_is_granted_and_gives_back_what_it_does_not_want_any_more() -> None:
@@ -158,7 +158,7 @@ def test_an_operator_frees_what_all_generations_of_an_external_vehicle_hold_and_
         )
         removal.hear_known(known)
     assert removal.known
-    assert removal.settled
+    assert removal.host.informed
     removal.begin(3)
     for heartbeat in range(1, 6):
         now_ns = heartbeat * 300_000_000
@@ -166,18 +166,20 @@ def test_an_operator_frees_what_all_generations_of_an_external_vehicle_hold_and_
             leader.take_host_state(told.standing, now_ns)
         table = leader.tick(now_ns)
         for granted in leader.granted(table, now_ns):
-            removal.hear_granted(granted, now_ns)
-            external.hear_granted(granted, now_ns)
+            removal.host.hear_granted(granted, now_ns)
+            external.host.hear_granted(granted, now_ns)
     assert removal.done
     assert not table.grants
     assert not table.fences
-    assert external.replaced
+    assert external.host.replaced
     assert external.cells == ()
 
     back = ExternalVehicle(SHARDS, "rover", [generations[1]])
     for agent in SHARDS.agents:
         generation, _ = leader._orders.hosts["rover"]
-        back.hear_known(Known(agent=agent, disk=0, generation=generation, shards=[], agents=[], generations=[]))
+        back.host.hear_known(
+            Known(agent=agent, disk=0, generation=generation, shards=[], agents=[], generations=[])
+        )
     back.enter(90)
     back.begin(9)
     talk(back, leader, 2_000_000_000)
@@ -189,8 +191,8 @@ def test_an_operator_frees_what_all_generations_of_an_external_vehicle_hold_and_
 def test_a_replaced_external_vehicle_says_nothing_and_takes_nothing() -> None:
     external, _ = entered()
     told = Granted(shard=0, host="rover", agent=SHARDS.leader(0, 6), epoch=6, seq=50, generation=1 << 40, heard=0)
-    external.hear_granted(told, 5)
-    assert external.replaced
+    external.host.hear_granted(told, 5)
+    assert external.host.replaced
     assert external.tick(6) == []
     assert external.cells == ()
 

@@ -21,9 +21,9 @@ def test_a_grant_that_is_implausibly_far_ahead_is_refused_and_named() -> None:
     for lie in (table_of(far, 1, a0=[9]), table_of(1, 1 << 40, a0=[9])):
         hear(holdings, lie, S)
         assert "implausibly far ahead" in holdings.refused.pop()
-        assert holdings.heard_ns(0) == 0
+        assert holdings._views[0].heard_ns == 0
     hear(holdings, table_of(1, 1, a0=[9]), 2 * S)
-    assert (list(holdings.path("a0-00")), holdings.heard_ns(0)) == ([9], 2 * S)
+    assert (list(holdings.path("a0-00")), holdings._views[0].heard_ns) == ([9], 2 * S)
 
 
 def test_a_generation_that_is_replaced_places_no_vehicle_by_a_grant_that_comes_late() -> None:
@@ -163,7 +163,7 @@ def test_a_host_is_gone_once_it_holds_and_requests_nothing_and_every_leader_know
     holdings = holdings_of()
     hear(holdings, table_of(1, 1, a0=[9]))
     assert not holdings.gone
-    holdings.shards.clear()
+    holdings.watched.clear()
     assert not holdings.gone, "a vehicle still has a path"
     holdings.leave("a0-00")
     assert holdings.gone

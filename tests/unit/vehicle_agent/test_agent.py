@@ -46,7 +46,8 @@ def agent_of(scenario: Scenario, index: int = 0) -> Agent:
     ground = LocalMap(GRID, LEVEL, LEVEL, LEVEL, LEVEL)
     plan = plan_agents(scenario)[index]
     holdings = Holdings(Shards(GRID, ["a0", "a1"]), plan.id, plan.vehicle_ids)
-    holdings.begin(1, [])
+    holdings.begin_as(1, [])
+    holdings.watch([0])
     return Agent(plan, scenario, ground, TruthSensor(GRID, LEVEL, 20.0), holdings)
 
 

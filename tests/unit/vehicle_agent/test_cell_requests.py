@@ -13,8 +13,7 @@ from swarm.right_of_way.holdings import Wish
 from swarm.wire.messages.vehicles import Obstacle
 from vehicle_agent.driving.driven_vehicle import GivenRoute, Vehicle
 from vehicle_agent.obstacles import Obstacles
-from vehicle_agent.traffic.cell_requests import CellRequests
-from vehicle_agent.traffic.next_cells import FAR_CELLS, Steering
+from vehicle_agent.traffic.next_cells import FAR_CELLS, CellRequests, Steering
 
 GRID = GridSpec(24, 24, 10.0, 0.0, 240.0)
 TICK_NS = NS_PER_S // 10
@@ -46,10 +45,8 @@ class Place:
         self.steering = Steering(GRID, self.pace, PlannerConfig(), RESERVE, self.obstacles)
         self.target = GRID.cell(12, 12)
         self.wishes = CellRequests(
-            GRID,
             self.steering,
             self.held,  # type: ignore[arg-type]
-            self.obstacles,
             2 * FAR_CELLS + 2,
             lambda target: self.target,
             lambda target, cell: GRID.distance_cells(cell, self.target) < 3,

@@ -49,7 +49,7 @@ def test_a_silent_member_says_nothing_and_remembers_nothing_that_is_not_on_file(
 def test_a_silent_leader_sends_no_table_and_its_host_still_tells_where_its_vehicles_stand() -> None:
     rights = member()
     rights.begin(1)
-    rights.holdings.watch([0])
+    rights.host.watch([0])
     said = _through(rights, range(1, 40))
     assert any(isinstance(action, Save | AskPromises) for action in said)
     rights.silent = True
@@ -80,8 +80,8 @@ def test_a_replaced_generation_finds_the_shards_that_keep_its_cells_shut_and_say
     for name in AGENTS[:4]:
         older.hear_known(Known(agent=name, disk=7, generation=0, shards=[]))
     assert older.settled
-    older.holdings.shards.clear()
-    older.holdings.replaced = True
+    older.host.watched.clear()
+    older.host.replaced = True
     assert not older.settled  # the question about it is repeated
     older.hear_known(known)
     (told,) = older.tick({}, S)
@@ -94,7 +94,7 @@ def test_whoever_waits_in_a_shard_without_a_leader_says_so() -> None:
 
     def hear(seq: int, now_ns: int) -> None:
         table = table_of(1, seq, a0=[0])
-        table.hosts["a0"] = (rights.holdings.generation, 1)
+        table.hosts["a0"] = (rights.host.generation, 1)
         rights.host.hear_granted(granted_of(table), now_ns)
 
     assert rights.host.unled(S) == {}

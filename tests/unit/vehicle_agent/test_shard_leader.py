@@ -73,7 +73,7 @@ def test_an_older_generation_is_told_that_it_is_replaced_by_a_leader_that_never_
         assert (granted.host, granted.generation) == ("a1", 2 << 32)
         leader = Leader(SHARDS, "a0", 3, table, {"a1": ["a1-00"]})
     older = Holdings(SHARDS, "a1", ["a1-00"])
-    older.begin(1, [])
+    older.begin_as(1, [])
     older.watch([0])
     older.hear_granted(granted, S)
     assert older.replaced

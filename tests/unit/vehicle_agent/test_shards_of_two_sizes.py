@@ -142,7 +142,7 @@ def test_an_external_vehicle_goes_by_the_largest_shards_that_it_is_told_of(order
     for agent, cells in zip(agents, order, strict=True):
         known = Known(agent=agent, disk=0, generation=0, shards=[], agents=agents, shard_cells=cells)
         external._take_answers(external._answers.hear(known))
-    assert external.external.shards.side == LARGE
+    assert external.external.host.shards.side == LARGE
 
 
 def test_an_agent_tells_an_external_vehicle_of_larger_shards_only_if_the_run_has_them() -> None:

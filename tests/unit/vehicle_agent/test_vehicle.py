@@ -10,14 +10,19 @@ from hypothesis import strategies as st
 from support.vehicle_states import record, table
 
 from swarm.clock import NS_PER_S
-from swarm.grid import GridSpec
-from swarm.wire.messages.vehicles import VehicleState
+from swarm.grid import GridSpec, walk
+from swarm.wire.messages.vehicles import Followed, VehicleState
 from swarm.wire.route_columns import RouteStatus
-from vehicle_agent.driving.driven_vehicle import Follow, GivenRoute, Reason, Vehicle
+from vehicle_agent.driving.driven_vehicle import GivenRoute, Reason, Vehicle
 
 GRID = GridSpec(10, 10, 10.0)
 S = NS_PER_S
 ROUTE = GivenRoute("t0", (11, 12, 13, 14), 3.0, 2.5, partial=False)
+
+
+def cells_of(followed: Followed | None) -> list[int]:
+    assert followed is not None
+    return [*walk(GRID, followed.start, followed.directions)]
 
 
 @pytest.fixture
@@ -88,7 +93,8 @@ def test_a_pushed_route_replaces_the_old_one_from_here_on(follower: Vehicle) -> 
     follower.motion.advance(100.0, 0.1)
     follower.route.moved(12)
     pushed = GivenRoute("t0", (11, 12, 22, 32), 3.0, 3.0, partial=False, pushed=True)
-    assert follower.give_route(pushed, [follower.cell], 2 * S) == Follow("v", "t0", (12, 22, 32), 3.0, 3.0)
+    followed = follower.give_route(pushed, [follower.cell], 2 * S)
+    assert (cells_of(followed), followed.target, followed.cost_s) == ([12, 22, 32], "t0", 3.0)
 
 
 def test_a_pushed_route_that_does_not_pass_here_makes_it_stop_and_ask(follower: Vehicle) -> None:
@@ -98,18 +104,14 @@ def test_a_pushed_route_that_does_not_pass_here_makes_it_stop_and_ask(follower: 
 
 
 def test_a_route_to_another_target_is_ignored(follower: Vehicle) -> None:
-    assert (
-        follower.give_route(
-            GivenRoute("t1", (11, 21), 1.0, 1.0, partial=False, pushed=True), [follower.cell], 2 * S
-        )
-        is None
-    )
+    pushed = GivenRoute("t1", (11, 21), 1.0, 1.0, partial=False, pushed=True)
+    assert follower.give_route(pushed, [follower.cell], 2 * S) is None
     assert follower.route.ahead() == [12, 13, 14]
 
 
 def test_a_route_may_begin_where_the_path_ends_that_it_still_drives(follower: Vehicle) -> None:
     given = GivenRoute("t0", (13, 23, 33), 1.0, 1.0, partial=False)
-    assert follower.give_route(given, [11, 12, 13], 2 * S) == Follow("v", "t0", (11, 12, 13, 23, 33), 1.0, 1.0)
+    assert cells_of(follower.give_route(given, [11, 12, 13], 2 * S)) == [11, 12, 13, 23, 33]
     assert follower.route.after(13, 9) == [23, 33]
 
 
