@@ -226,7 +226,7 @@ class Sinks:
         if config.live:
             host, port = behind = _hidden_address()
             self.page = page or when_free(lambda: LivePage(config.web_port))
-            self.page.opens(behind)
+            self.page.server.behind = behind
             live.append(rr.GrpcServerSink(bind_ip=host, port=port, server_memory_limit=_MEMORY))
         try:
             self.rec.set_sinks(*_files(path), *live, default_blueprint=blueprint)

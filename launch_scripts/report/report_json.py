@@ -6,7 +6,6 @@ import csv
 import importlib.metadata
 import io
 import json
-import logging
 from collections.abc import Mapping
 from dataclasses import asdict
 from pathlib import Path
@@ -25,8 +24,6 @@ from shared_map.terrain.terrain_report import bounds_deg
 from swarm.files import write_file
 
 PICTURE_FILE = "report.png"
-
-log = logging.getLogger(__name__)
 
 
 def make_report(recorder: Recorder, terrain: Terrain, **measured: Any) -> dict[str, Any]:

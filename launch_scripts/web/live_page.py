@@ -72,10 +72,6 @@ class LivePage:
         }
         self.server = Server("web_port", port, pages, lasts_s=_LASTS_S)
 
-    def opens(self, stream: tuple[str, int]) -> None:
-        """Passes requests for the stream on to rerun's server from now on."""
-        self.server.behind = stream
-
     @property
     def is_open(self) -> bool:
         """True while a page polls, be it before its viewer has a stream."""

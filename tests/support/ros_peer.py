@@ -43,7 +43,7 @@ def ros_router(port: int | None = None) -> Iterator[int]:
 
 def write_definitions(folder: Path, types: RosTypes) -> Path:
     """.msg and .srv files of all that is known, as the SDK reads them instead of fetching some."""
-    parts = set(types.names)
+    parts = set(types._store.fielddefs)
     for name in parts:
         package, kind, base = name.split("/")
         if kind == "msg":

@@ -77,11 +77,6 @@ class RosTypes:
         parts = (("request_message", REQUEST), ("response_message", RESPONSE), ("event_message", _EVENT))
         self._store.register({name: ([], [(field, (Nodetype.NAME, name + part)) for field, part in parts])})
 
-    @property
-    def names(self) -> list[str]:
-        """Names of all types: messages, and the parts of services."""
-        return sorted(self._store.fielddefs)
-
     def hash_of(self, name: str) -> str:
         """RIHS01_... of a message or a service (of the service itself, not of its parts)."""
         return NO_HASH if self.distribution == "humble" else self._store.hash_rihs01(name)
