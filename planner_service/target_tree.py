@@ -589,7 +589,9 @@ class TargetTree:
 
     def _without_path(self, starts: NDArray[np.int64]) -> NDArray[np.int64]:
         """Those of some padded cells from which the tree leads nowhere, or not yet."""
-        return starts[(self._tree.parent[starts] == NONE) & (starts != self._costs.pad(self._tree.root))]
+        root = self._costs.pad(self._tree.root)
+        without: NDArray[np.int64] = starts[(self._tree.parent[starts] == NONE) & (starts != root)]
+        return without
 
     def _open(self, cells: Any) -> NDArray[np.int64]:
         """Those of some numbers that are passable cells of the grid, padded."""
