@@ -282,6 +282,12 @@ class ExternalSession:
             self._service.enter(cell, self._clock.now_ns())
         return self._wait(lambda: bool(self.cells), timeout_s)
 
+    @property
+    def _vehicle(self) -> ExternalVehicle:
+        if self._service.external is None:
+            raise ValueError("it has not entered: no agent of the run has answered yet")
+        return self._service.external
+
     def want(self, path: Sequence[int], aside: Sequence[int] = ()) -> None:
         """States where it would go: the cell on which it stands first, each next to the one before. Cells that it
         holds and that are not the beginning of this path are given back.
@@ -291,10 +297,7 @@ class ExternalSession:
         Raises ValueError if it has not entered, or the path begins elsewhere or leaps.
         """
         with self._changed:
-            external = self._service.external
-            if external is None:
-                raise ValueError("it has not entered: no agent of the run has answered yet")
-            external.want(path, aside)
+            self._vehicle.want(path, aside)
             self._service.tell(self._clock.now_ns())
 
     def may_enter(self, cell: int, timeout_s: float | None = None) -> bool:
@@ -304,10 +307,7 @@ class ExternalSession:
     def left(self, cell: int) -> None:
         """It has left a cell for the next of `cells`. Raises ValueError if it holds none after it."""
         with self._changed:
-            external = self._service.external
-            if external is None:
-                raise ValueError("it has not entered")
-            external.left(cell)
+            self._vehicle.left(cell)
             self._service.tell(self._clock.now_ns())
 
     def stands(self, cell: int) -> bool:

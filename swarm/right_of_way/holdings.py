@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
 from hashlib import blake2b
@@ -256,9 +256,10 @@ class Holdings:
 
     # --- what leaders say -----------------------------------------------------------------------------------
 
-    def watch(self, shards: Collection[int]) -> None:
-        """Makes these shards concern us, until they are seen to hold nothing of ours."""
-        for shard in shards:
+    def watch(self, shards: Iterable[int]) -> None:
+        """Makes these shards concern us, if they are shards of the layer, until they are seen to hold nothing of
+        ours."""
+        for shard in filter(self.shards.all.__contains__, shards):
             self.watched.setdefault(shard)
             self._views.setdefault(shard, _View())
 

@@ -44,7 +44,7 @@ class Host(Holdings):
         self._told_by.add(known.agent)
         if not is_far_ahead(known.generation, self._known_generation):
             self._known_generation = max(self._known_generation, known.generation)
-        self.watch([shard for shard in known.shards if shard in self.shards.all])
+        self.watch(known.shards)
 
     @property
     def informed(self) -> bool:

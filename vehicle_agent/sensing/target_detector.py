@@ -173,10 +173,7 @@ class EmptyPlaces:
     def placed(self, target: str, *, by_sight: bool) -> None:
         """Notes a new position of a target: by a sighting, or by its tracker."""
         self._found_ns.pop(target, None)
-        if by_sight:
-            self._by_sight.add(target)
-        else:
-            self._by_sight.discard(target)
+        (self._by_sight.add if by_sight else self._by_sight.discard)(target)
 
     def find_gone(self, stood_at: Iterable[str], now_ns: int) -> bool:
         """Finds which targets are gone; returns whether one is that was not before.

@@ -59,16 +59,18 @@ class Detours:
 
     def tick(self, vehicles: Iterable[Vehicle], path: Callable[[str], Sequence[int]], now_ns: int) -> None:
         """Begins and continues searches; vehicles for which one has ended follow what it has found."""
-        standing = self.obstacles.standing if self.obstacles.any else ()
+        standing = self.obstacles.standing if self.obstacles.any else set[int]()
         if not standing:
             self._searches.clear()
             self._waits.clear()
             return
-        blocked = {each.id: each for each in vehicles if self._is_blocked(each, standing)}
-        for gone in self._searches.keys() - blocked.keys():
-            del self._searches[gone]
-        for gone in self._waits.keys() - blocked.keys():
-            del self._waits[gone]
+        blocked = {
+            each.id: each
+            for each in vehicles
+            if not each.in_reach and not standing.isdisjoint(each.route.ahead(_LOOK_CELLS))
+        }
+        self._searches = {id: each for id, each in self._searches.items() if id in blocked}
+        self._waits = {id: each for id, each in self._waits.items() if id in blocked}
         left = _CELLS_PER_TICK
         for id, vehicle in blocked.items():
             if left <= 0:
@@ -89,11 +91,6 @@ class Detours:
                 way = None
             del self._searches[id]
             self._end(vehicle, way, path(id), now_ns)
-
-    def _is_blocked(self, vehicle: Vehicle, standing: set[int]) -> bool:
-        if vehicle.in_reach or not vehicle.route.left:
-            return False
-        return not standing.isdisjoint(vehicle.route.ahead(_LOOK_CELLS))
 
     def _end(self, vehicle: Vehicle, way: list[int] | None, path: Sequence[int], now_ns: int) -> None:
         # It may have driven on meanwhile, to where the way does not pass.

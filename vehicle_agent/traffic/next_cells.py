@@ -199,13 +199,10 @@ class Steering:
             self.forget(vehicle.id)
             if cell == vehicle.cell:
                 vehicle.blocked_for_long(now_ns)
-                if self._is_shut_in(cell):
+                beside = (each for _, each in self.grid.neighbours(cell))
+                if not self.steps(cell) and any(each in self._shut for each in beside):
                     self.shut_in.add(vehicle.id)
         return True
-
-    def _is_shut_in(self, cell: int) -> bool:
-        """Returns True if no step leads from a cell, and obstacles close a cell beside it."""
-        return not self.steps(cell) and any(each in self._shut for _, each in self.grid.neighbours(cell))
 
     def _ahead(self, vehicle: Vehicle, path: Sequence[int]) -> list[int]:
         """The next cells of the route after what it holds; none if that ends beside the route."""

@@ -146,8 +146,7 @@ class RightOfWay:
         """
         self.host.hear_known(self._known_of(self.agent, self.own.disk))
         generations = self.host.begin(self.own.generations, chance)
-        home = map(self.shards.of, self.spawns.get(self.agent, {}).values())
-        self.host.watch([shard for shard in home if shard in self.shards.all])
+        self.host.watch(map(self.shards.of, self.spawns.get(self.agent, {}).values()))
         self.own = replace(self.own, generations=generations)
         return [self.own]
 

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Collection, Iterator, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import InitVar, dataclass, field
 from functools import lru_cache
 from itertools import chain
 from zlib import crc32
@@ -105,32 +105,27 @@ class _Host:
     told_ns: int = 0
 
 
+@dataclass
 class Leader:
     """Holds one shard's table in one epoch. Every `tick` may make a new one, which counts once a majority stored
     it.
 
-    fleets  agent -> its vehicles, all of the scenario's. Any other host is an external vehicle
-    (docs/design/external-vehicles.md): its vehicles are
-            those that bear its name
+    fleets   agent -> its vehicles, all of the scenario's. Any other host is an external vehicle
+             (docs/design/external-vehicles.md): its vehicles are those that bear its name
     without  agent -> number of its newest revoked certificate, after which the table was agreed by the others
     """
 
-    def __init__(
-        self,
-        shards: Shards,
-        me: str,
-        epoch: int,
-        table: Table,
-        fleets: Mapping[str, Collection[str]],
-        without: Mapping[str, int] | None = None,
-    ) -> None:
-        self.epoch = epoch
+    _shards: Shards
+    _me: str
+    epoch: int
+    table: InitVar[Table]
+    _fleets: Mapping[str, Collection[str]]
+    without: InitVar[Mapping[str, int] | None] = None
+
+    def __post_init__(self, table: Table, without: Mapping[str, int] | None) -> None:
         self.seq = 0
         self.refused: list[str] = []
-        self._shards = shards
         self._shard = table.shard
-        self._me = me
-        self._fleets = fleets
         self._without = dict(table.without)
         for name, number in (without or {}).items():
             self._without[name] = max(number, self._without.get(name, 0))

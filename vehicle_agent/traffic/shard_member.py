@@ -7,7 +7,7 @@ be on file before any message states them. Clocks decide only when a member trie
 from __future__ import annotations
 
 from collections.abc import Collection, Mapping
-from dataclasses import dataclass
+from dataclasses import InitVar, dataclass, field
 
 from swarm.clock import NS_PER_S
 from swarm.right_of_way.generations import FURTHEST_EPOCH, HEARTBEAT_NS
@@ -89,6 +89,7 @@ class RoundTrips:
         return {agent: mean for agent, (mean, _) in self._known.items() if mean > SLOW_NS}
 
 
+@dataclass
 class Member:
     """One agent's seat among the members of one shard.
 
@@ -101,30 +102,23 @@ class Member:
     tick_ns   between two ticks
     """
 
-    def __init__(
-        self,
-        shards: Shards,
-        me: str,
-        promised: int,
-        stored: Table,
-        fleets: Mapping[str, Collection[str]],
-        now_ns: int,
-        trips: RoundTrips | None = None,
-        tick_ns: int = _TICK_NS,
-    ) -> None:
-        self.shard = stored.shard
-        self._trips = RoundTrips() if trips is None else trips
-        self._tick_ns = tick_ns
+    _shards: Shards
+    _me: str
+    promised: int
+    stored: Table
+    _fleets: Mapping[str, Collection[str]]
+    now_ns: InitVar[int]
+    _trips: RoundTrips = field(default_factory=RoundTrips)
+    _tick_ns: int = _TICK_NS
+
+    def __post_init__(self, now_ns: int) -> None:
+        shards, me = self._shards, self._me
+        self.shard = self.stored.shard
         self._asked: dict[Stamp, int] = {}
         """Stamp of a table that was sent once -> when; of a claim the sequence is 0."""
-        self.promised = promised
-        self.stored = stored
         self.leader: Leader | None = None
-        self._shards = shards
-        self._me = me
-        self._fleets = fleets
         self._members = shards.members(self.shard)
-        self._witness = Witness(me, shards, fleets) if shards.proven else None
+        self._witness = Witness(me, shards, self._fleets) if shards.proven else None
         self._others = tuple(member for member in self._members if member != me)
         self._revoked: dict[str, int] = {}
         """Agent -> number of its newest revoked certificate."""
@@ -145,7 +139,7 @@ class Member:
         self._said_ns = now_ns
         self._has: dict[str, tuple[Stamp, int]] = {}
         """Other member -> the table that it said last to have stored, and when."""
-        self._bases = {stored.stamp: stored}
+        self._bases = {self.stored.stamp: self.stored}
         """Stamp -> table, of those that were stored last."""
 
     # --- timeouts -------------------------------------------------------------------------------------------
