@@ -198,7 +198,7 @@ def _serve_metrics(network: NetworkConfig, port: int, address: str) -> None:
     from launch_scripts.web.prometheus import MetricsEndpoint, families
     from swarm.bus.zenoh_bus import open_bus
     from swarm.clock import MonotonicClock
-    from swarm.runtime.health import Health, supervisor_of
+    from swarm.runtime.loop_health import Health, supervisor_of
     from swarm.wire.topics import STATS, STATUS
 
     health = Health(supervisor=supervisor_of(os.environ))
