@@ -19,7 +19,7 @@ from swarm.config.vehicle_classes import GROUND, class_numbers, first_classes
 from swarm.liveness import job_of
 from swarm.runtime.election import Candidacy
 from swarm.runtime.membership import Member
-from swarm.runtime.obedience import Obedience
+from swarm.runtime.order_client import OrderClient
 from swarm.runtime.role_setup import RoleSetup
 from swarm.wire.messages.orders import Obey
 from swarm.wire.messages.planning import PushedRoute
@@ -69,7 +69,7 @@ class PlanningProcess:
         self._replica = MapReplica(terrain.grid, self._maps, filter=self._mark_filter)
         self._sync = MapSync(self._replica, bus, post, scenario.map, setup.role, at_ticks=True)
         self._learned = LearnedGauges(cost_map.keys, self.counters)
-        self._obedience = Obedience(setup, bus, post, self._obeys)
+        self._obedience = OrderClient(setup, bus, post, self._obeys)
         self._leads = False
         self._now_ns = 0
         self._member.needs("the shared map", lambda: self._sync.joined)

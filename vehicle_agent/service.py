@@ -19,7 +19,7 @@ from swarm.bus.bus import Appeared, Asked, AskEnded, Bus, Disappeared, Event, He
 from swarm.clock import NS_PER_S
 from swarm.config.agent_plan import place_job
 from swarm.liveness import Roster, job_of
-from swarm.runtime.obedience import Obedience
+from swarm.runtime.order_client import OrderClient
 from swarm.runtime.role_setup import RoleSetup
 from swarm.runtime.stats import GAPS_OF, GAPS_TO, UNPROVEN_OF, UNPROVEN_TO
 from swarm.wire.fields import column
@@ -113,7 +113,7 @@ class AgentService:
         self.counters = self._member.counters
         for name in _COUNTED_FROM_0:
             self.counters.count(name, 0)
-        self._obedience = Obedience(setup, bus, post, self._obeys, self.agent.goals.book)
+        self._obedience = OrderClient(setup, bus, post, self._obeys, self.agent.goals.book)
         self._places_job = place_job(setup.scenario, self.agent.plan.group.name)
         """The process that plans to places for the group."""
         self._obeyed_version = 0

@@ -188,7 +188,7 @@ def metrics(
     from launch_scripts.web.health_pages import Process
     from launch_scripts.web.prometheus import MetricsEndpoint, families
     from swarm.clock import MonotonicClock
-    from swarm.runtime.health import Health, supervisor_of
+    from swarm.runtime.loop_health import Health, supervisor_of
     from swarm.wire.topics import STATS, STATUS
 
     health = Health(supervisor=supervisor_of(os.environ))

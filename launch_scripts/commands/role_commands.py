@@ -26,7 +26,7 @@ from swarm.errors import ConfigError
 from swarm.liveness import ranked_id
 
 if TYPE_CHECKING:
-    from swarm.runtime.health import Health
+    from swarm.runtime.loop_health import Health
     from swarm.wire.messages.processes import RunInfo
 
 app = typer.Typer()
@@ -195,7 +195,7 @@ def _health_of(name: str, part: Part) -> Health:
     """Returns the health reports of the role: to its supervisor, and to probes if they have a port."""
     from launch_scripts.web.health_pages import Process, health_pages
     from launch_scripts.web.http_server import Server
-    from swarm.runtime.health import Health, supervisor_of
+    from swarm.runtime.loop_health import Health, supervisor_of
 
     health = Health(supervisor=supervisor_of(os.environ))
     if part.health_port is not None:

@@ -21,7 +21,7 @@ from launch_scripts.parent_death import end_with_parent
 from launch_scripts.process_table import TABLE
 from swarm.errors import SwarmError
 from swarm.files import discard_output
-from swarm.runtime.health import Board, Health
+from swarm.runtime.loop_health import Board, Health
 from swarm.runtime.role_setup import RoleSetup
 
 CRASHED = 70

@@ -24,7 +24,7 @@ from launch_scripts.process_table import STOP_ORDER, TABLE, ProcessSpec
 from launch_scripts.web.health_pages import Process
 from swarm.errors import StoreError, SwarmError
 from swarm.plugins.guard import KILLED_BY
-from swarm.runtime.health import BOARD_BYTES, Board, Phase
+from swarm.runtime.loop_health import BOARD_BYTES, Board, Phase
 from swarm.runtime.role_setup import RoleSetup
 
 log = logging.getLogger(__name__)

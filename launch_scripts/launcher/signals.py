@@ -14,7 +14,7 @@ from typing import TYPE_CHECKING, TypeVar
 from launch_scripts.launcher.run_options import UpOptions
 from launch_scripts.web.health_pages import Process
 from swarm.errors import BusError
-from swarm.runtime.health import Health, supervisor_of
+from swarm.runtime.loop_health import Health, supervisor_of
 
 if TYPE_CHECKING:
     from launch_scripts.observe.latest_messages import LatestState

@@ -19,7 +19,7 @@ from launch_scripts.observe.run_registry import LAUNCHER_LOG, logging_into, open
 from launch_scripts.process_table import ROLES, TABLE
 from swarm.errors import ConfigError
 from swarm.liveness import job_of
-from swarm.runtime.health import GENERATION_BEFORE
+from swarm.runtime.loop_health import GENERATION_BEFORE
 
 log = logging.getLogger(__name__)
 

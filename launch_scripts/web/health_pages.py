@@ -11,7 +11,7 @@ from typing import NamedTuple
 from launch_scripts.plain_text import Duration
 from launch_scripts.web import PROBED, READY, Page, Reply
 from swarm.clock import NS_PER_S
-from swarm.runtime.health import Phase, Vitals
+from swarm.runtime.loop_health import Phase, Vitals
 
 
 class Process(NamedTuple):

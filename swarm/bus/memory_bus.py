@@ -2,7 +2,8 @@
 
 Everything is encoded and decoded as on the wire, once per message; all subscribers share the frozen result. A
 `LinkModel` decides what a link does to a message (delay, loss, repetition, partition), so that a seed replays a
-run. Only collected samples are buffered: a handler takes no simulated time, and no reader falls behind.
+run. Only collected samples are buffered: a handler takes no simulated time, and no reader falls behind. JSON is for
+programs from outside, of which a simulation has none.
 """
 
 from __future__ import annotations
@@ -35,8 +36,8 @@ from swarm.clock import NS_PER_S
 from swarm.errors import ProtocolError
 from swarm.liveness import Peer
 from swarm.wire.access import Authenticator, check_code, code_of
-from swarm.wire.codec import decode, decode_either, encode, may_be_json, packed_json
-from swarm.wire.meant_key import SHARED, check_meant, meant_for
+from swarm.wire.codec import decode, decode_either, encode
+from swarm.wire.meant_key import check_meant, meant_for
 from swarm.wire.messages import Message
 from swarm.wire.topics import TOPICS, Topic, check_size
 
@@ -410,19 +411,13 @@ class MemoryBus:
     def publish(self, topic: Topic, message: Message, **fields: str | int) -> None:
         if not self.closed:
             named, key = topic.value(fields)
-            self._put(topic, named, key, meant_for(key, encode(message)))
+            self.put(topic, named, key, meant_for(key, encode(message)))
 
-    def publish_bytes(
-        self, topic: Topic, payload: bytes, fields: Mapping[str, str | int], *, in_json: bool = False
-    ) -> None:
-        """Puts any payload at all: tests send garbage with it, and JSON."""
-        if not self.closed:
-            self._put(topic, *topic.value(fields), payload, in_json)
-
-    def _put(self, topic: Topic, named: Mapping[str, str], key: str, payload: bytes, in_json: bool = False) -> None:
+    def put(self, topic: Topic, named: Mapping[str, str], key: str, payload: bytes) -> None:
+        """Puts a payload, whatever it is, under a key and its fields."""
         self.sent(payload)
         code = code_of(self.authenticator, key, payload)
-        sample = _Sample(topic, named, key, payload, code, in_json, checked_by=self.authenticator)
+        sample = _Sample(topic, named, key, payload, code, checked_by=self.authenticator)
         network = self.network
         arrivals: dict[int, list[Declaration]] = {}
         for subscription in network.subscriptions[self.namespace, topic.name].find(named):
@@ -687,7 +682,6 @@ class _Sample:
     key: str
     payload: bytes
     code: bytes | None
-    in_json: bool
     checked_by: Authenticator | None = None
     parsed: bool = False
     parses: Heard | ProtocolError = _UNPARSED
@@ -713,10 +707,7 @@ class _Sample:
         payload, kind = self.payload, self.topic.message
         try:
             check_size(payload, self.topic.put_bytes)
-            in_json = self.in_json and may_be_json(payload)
-            if in_json:
-                payload = packed_json(payload, kind, self.fields)
-            check_meant(self.key, payload, must=in_json and kind in SHARED)
+            check_meant(self.key, payload)
             event = Heard(self.topic, self.fields, decode(payload, kind))
         except ProtocolError as error:
             self.parses = self.fits = error

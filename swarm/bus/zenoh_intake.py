@@ -139,12 +139,6 @@ def guarded(callback: Callable[..., None]) -> Callable[..., None]:
     return guard
 
 
-def attached(carrier: Any) -> bytes | None:
-    """Returns the attachment of a sample or a query."""
-    attachment: bytes | None = None if carrier.attachment is None else carrier.attachment.to_bytes()
-    return attachment
-
-
 def is_json(carrier: Any, payload: bytes) -> bool:
     """Returns True if the encoding of a sample or query is JSON. The lookup costs more than reading the first
     byte."""
@@ -273,7 +267,8 @@ class Intake:
 
         asked  the payload of the question, where this is an answer
         """
-        check_code(self.authenticator, attached(carrier), topic, act, key, payload, asked)
+        code = None if carrier.attachment is None else carrier.attachment.to_bytes()
+        check_code(self.authenticator, code, topic, act, key, payload, asked)
 
     def fields(self, topic: Topic, key: str) -> dict[str, str]:
         """Parses the fields of a key. Raises ProtocolError where it is none of the topic's."""

@@ -7,7 +7,7 @@ order that was taken back stays in the book as such, or an old one that comes la
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
 from typing import Any, Generic, Protocol, TypeVar
 
 import msgspec
@@ -159,7 +159,9 @@ class OrderBook(Register[Key, Order]):
                 if order.off:
                     found.pop(order.name, None)
                 elif order.added:
-                    found[order.name] = target_of(order)
+                    found[order.name] = TargetConfig(
+                        name=order.name, walk=order.walk, speed_m_per_s=order.speed_m_per_s
+                    )
         return found
 
     def targets_of(self, group: str, scenario: Scenario) -> list[str]:
@@ -198,11 +200,6 @@ class FreshOrders:
             return "this order was given before, and counts once"
         self._taken.add(stamp_ns)
         return None
-
-
-def target_of(order: Order) -> TargetConfig:
-    """A target that was added, as the scenario would say it."""
-    return TargetConfig(name=order.name, walk=order.walk, speed_m_per_s=order.speed_m_per_s)
 
 
 _OFF = {
@@ -246,8 +243,7 @@ def judged(
     vehicles  ids of all vehicles
     """
     assert given.subject is not None
-    fault = _FAULTS[given.subject](given, book, scenario, vehicles)
-    if fault is not None:
+    if (fault := _fault(given, book, scenario, vehicles)) is not None:
         return fault
     before = book.about(given.subject, given.name)
     full = len(book) >= MOST_ORDERS and not book.knows(given.subject, given.name, 0)
@@ -270,12 +266,29 @@ def judged(
     )
 
 
-def _of_pause(given: GiveOrder, book: OrderBook, scenario: Scenario, vehicles: Iterable[str]) -> str | None:
-    return f"pause: it has no name, found {given.name!r}" if given.name else None
-
-
-def _of_vehicle(given: GiveOrder, book: OrderBook, scenario: Scenario, vehicles: Iterable[str]) -> str | None:
-    return fault_of_vehicle(given.name, vehicles)
+def _fault(given: GiveOrder, book: OrderBook, scenario: Scenario, vehicles: Iterable[str]) -> str | None:
+    """Reason why an order is not possible; None if there is none."""
+    name = given.name
+    match given.subject:
+        case "pause":
+            return f"pause: it has no name, found {name!r}" if name else None
+        case "vehicle":
+            return fault_of_vehicle(name, vehicles)
+        case "set":
+            bounds = SETTINGS.get(name)
+            if bounds is None:
+                return f"set {name!r}: it cannot change while the swarm runs{_such_as(SETTINGS)}"
+            if not given.off and not (given.value is not None and bounds[0] <= given.value <= bounds[1]):
+                return f"set {name}: {given.value} is not in {bounds[0]:g} ... {bounds[1]:g}"
+            return None
+    targets = book.targets(scenario)
+    if given.subject == "target":
+        return _fault_of_target(given, targets, scenario)
+    groups = [group.name for group in scenario.groups]
+    if name not in groups:
+        return f"group {name!r}: there is none{_such_as(groups)}"
+    unknown = next((id for id in given.targets if id not in targets), None)
+    return None if unknown is None else f"group {name}: there is no target {unknown!r}{_such_as(targets)}"
 
 
 def fault_of_vehicle(vehicle: str, vehicles: Iterable[str]) -> str | None:
@@ -284,19 +297,7 @@ def fault_of_vehicle(vehicle: str, vehicles: Iterable[str]) -> str | None:
     return None if vehicle in known else f"vehicle {vehicle!r}: there is none{_such_as(known)}"
 
 
-def _of_group(given: GiveOrder, book: OrderBook, scenario: Scenario, vehicles: Iterable[str]) -> str | None:
-    groups = [group.name for group in scenario.groups]
-    if given.name not in groups:
-        return f"group {given.name!r}: there is none{_such_as(groups)}"
-    targets = book.targets(scenario)
-    for id in given.targets:
-        if id not in targets:
-            return f"group {given.name}: there is no target {id!r}{_such_as(targets)}"
-    return None
-
-
-def _of_target(given: GiveOrder, book: OrderBook, scenario: Scenario, vehicles: Iterable[str]) -> str | None:
-    targets = book.targets(scenario)
+def _fault_of_target(given: GiveOrder, targets: Mapping[str, TargetConfig], scenario: Scenario) -> str | None:
     there = given.name in targets
     if given.new and not any(target.is_simulated for target in scenario.targets):
         return f"target {given.name!r}: no process of this run moves targets, as all of its scenario have trackers"
@@ -309,18 +310,6 @@ def _of_target(given: GiveOrder, book: OrderBook, scenario: Scenario, vehicles: 
     if given.off and len(targets) == 1:
         return f"target {given.name!r} is the last one; pause the swarm instead"
     return None
-
-
-def _of_set(given: GiveOrder, book: OrderBook, scenario: Scenario, vehicles: Iterable[str]) -> str | None:
-    bounds = SETTINGS.get(given.name)
-    if bounds is None:
-        return f"set {given.name!r}: it cannot change while the swarm runs{_such_as(SETTINGS)}"
-    if not given.off and not (given.value is not None and bounds[0] <= given.value <= bounds[1]):
-        return f"set {given.name}: {given.value} is not in {bounds[0]:g} ... {bounds[1]:g}"
-    return None
-
-
-_FAULTS = {"pause": _of_pause, "vehicle": _of_vehicle, "group": _of_group, "target": _of_target, "set": _of_set}
 
 
 def _such_as(known: Iterable[str]) -> str:

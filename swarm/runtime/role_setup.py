@@ -9,7 +9,7 @@ from swarm.config.agent_plan import AddedAgent, crew_of
 from swarm.config.scenario import Scenario
 from swarm.config.vehicle_classes import class_numbers
 from swarm.grid import REGION_CELLS, GridSpec
-from swarm.runtime.health import Health
+from swarm.runtime.loop_health import Health
 from swarm.wire.fields import MOST_IDS
 from swarm.wire.messages import WIRE_VERSION
 from swarm.wire.messages.map_data import KEEPERS

@@ -114,12 +114,12 @@ def as_read(fields: Fields, message_type: type[Message]) -> Fields:
 
 def as_written(message: Message) -> Fields | None:
     """The fields and `schema` of the version before, where this build writes that one; None where it does not."""
-    step = STEPS.get(type(message))
-    if step is None or not step.writes_older(WIRE_VERSION):
+    written = written_schema(type(message))
+    if written == schema_of_type(type(message)):
         return None
     fields: Fields = msgspec.to_builtins(message, builtin_types=(bytes,))
-    newest = fields.pop("schema")
-    return {"schema": _before(newest)} | step.lowered(fields)
+    del fields["schema"]
+    return {"schema": written} | STEPS[type(message)].lowered(fields)
 
 
 FIRST_SHARED = 10

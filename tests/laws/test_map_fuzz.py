@@ -120,7 +120,7 @@ def test_mutated_payloads_on_the_bus_neither_stop_a_service_nor_keep_true_marks_
     for n in range(min(MUTATIONS, 20_000) // 10):
         payload = mutated(chance.choice(payloads), chance) if n % 10 else chance.choice(payloads)
         fields = {"region": "0", "tile": str(n % 6), "author": "b2.2"} if topic is MARKS else {"author": "b2.2"}
-        hostile.publish_bytes(topic, payload, fields)  # type: ignore[arg-type]
+        swarm.put_bytes(hostile, topic, payload, **fields)
         if n % 50 == 0:
             swarm.run(0.1)
     author.sync.publish(author.replica.write([5, 2700], MarkKind.LETHAL, 0.0, swarm.now_ns))

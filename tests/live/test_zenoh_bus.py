@@ -16,7 +16,8 @@ import msgspec
 import pytest
 import zenoh
 from support.bus_behaviour import *  # noqa: F403
-from support.bus_world import Box, answering, asked, pose
+from support.bus_behaviour import MARKS, TRUE_POSE
+from support.bus_world import Box, answering, asked, marks, pose
 from support.makers import cost_reply, run_info
 from support.processes import eventually
 from support.query_behaviour import *  # noqa: F403
@@ -24,8 +25,10 @@ from support.trusted_behaviour import *  # noqa: F403
 from support.trusted_behaviour import OURS, stored, table
 from support.zenoh_router import Router
 
+from docs.generate.wire_page import JSON_PATH as WIRE_PAGE
+from docs.generate.wire_page import example, key_fields, put_from_outside
 from launch_scripts.ports import free_ports
-from swarm.bus.bus import Appeared, Asked, AskEnded, Disappeared, Heard, LinkChanged, Replied
+from swarm.bus.bus import Appeared, Asked, AskEnded, Disappeared, Heard, HeardMany, LinkChanged, Replied
 from swarm.bus.zenoh_bus import ZenohBus, open_bus
 from swarm.clock import MonotonicClock
 from swarm.config.scenario import NetworkConfig
@@ -36,7 +39,7 @@ from swarm.runtime.operator import Operator
 from swarm.runtime.process import Process
 from swarm.runtime.stats import Counters
 from swarm.wire.access import CODE_BYTES, Authenticator
-from swarm.wire.codec import encode
+from swarm.wire.codec import encode, encode_json
 from swarm.wire.meant_key import meant_for
 from swarm.wire.messages import Nothing
 from swarm.wire.messages.orders import GiveOrder, Obeyed, Order, Orders
@@ -105,6 +108,50 @@ def world(router: Router) -> Iterator[ZenohWorld]:
     world = ZenohWorld(router)
     yield world
     world.close()
+
+
+def test_a_person_may_put_json_by_its_encoding_and_leave_out_what_the_key_says(world: ZenohWorld):
+    a, b = world.bus("a"), world.bus("b")
+    alone, together = Box(), Box()
+    b.subscribe(TRUE_POSE, alone)
+    b.collect(TRUE_POSE)
+    b.subscribe(MARKS, together, together=True)
+    world.settle()
+    unnamed = b' {"incarnation": 1, "seq": 1, "stamp_ns": 5, "cell": 3, "x_m": 1, "y_m": 2.0}'
+    short = unnamed[:-1] + b', "key": "world/target/t0/pose"}'
+    world.put_bytes(a, TRUE_POSE, short, in_json=True, target="t0")
+    world.put_bytes(a, TRUE_POSE, short, in_json=True, target="t4")  # it is meant for t0
+    world.put_bytes(a, TRUE_POSE, unnamed, in_json=True, target="t5")  # the key of a pose is not implied
+    world.put_bytes(a, TRUE_POSE, short, target="t1")  # without the encoding it is garbage
+    world.put_bytes(
+        a, TRUE_POSE, encode(pose("t2")), in_json=True, target="t2"
+    )  # whatever it says, this is MessagePack
+    world.put_bytes(a, TRUE_POSE, b'{"target": "t9", ' + short[2:].replace(b"t0", b"t3"), in_json=True, target="t3")
+    world.put_bytes(a, MARKS, encode_json(marks("a0.1", 7)), in_json=True, region="0", tile="7", author="a0.1")
+    world.put_bytes(a, MARKS, b'{"epoch": "x"', in_json=True, region="0", tile="8", author="a0.1")
+    world.until(lambda: len(alone) == 2 and together)
+    assert [event.message for event in alone] == [pose(), pose("t2")]
+    assert together == [HeardMany(MARKS, [("marks/0/7/a0.1", marks("a0.1", 7))])]
+    world.until(lambda: b.counts["payloads_dropped"] == 4)
+    b.gather()
+    assert [event.message for event in b.collected(TRUE_POSE)] == [pose(), pose("t2")]
+    assert b.counts["payloads_misrouted"] == 2  # heard and collected
+
+
+def test_the_least_json_of_the_reference_is_heard_on_each_key_where_programs_outside_may_put(world: ZenohWorld):
+    a, b, page = world.bus("a"), world.bus("b"), WIRE_PAGE.read_text()
+    topics = put_from_outside()
+    assert {topic.name for topic in topics} >= {"pose", "body", "marks", "note"}
+    for topic in topics:
+        assert f"| `{topic.below(key_fields(topic))}` | `{example(topic)}` |" in page
+        box = Box()
+        b.subscribe(topic, box)
+        world.settle()
+        world.put_bytes(a, topic, example(topic).encode(), in_json=True, **key_fields(topic))
+        world.until(lambda box=box: box)
+        assert [type(event.message) for event in box] == [topic.message]
+        assert box[0].fields == key_fields(topic)
+    assert b.counts["payloads_dropped"] == 0
 
 
 def serve_cost(bus: ZenohBus, requests: list[CostRequest]) -> None:

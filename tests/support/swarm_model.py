@@ -141,10 +141,8 @@ class SwarmModel:
     def bus(self, node: str, namespace: str = "swarm", authenticator: Authenticator | None = None) -> MemoryBus:
         return self.network.bus(node, namespace, authenticator)
 
-    def put_bytes(
-        self, bus: MemoryBus, topic: Topic, payload: bytes, *, in_json: bool = False, **fields: str
-    ) -> None:
-        bus.publish_bytes(topic, payload, fields, in_json=in_json)
+    def put_bytes(self, bus: MemoryBus, topic: Topic, payload: bytes, **fields: str) -> None:
+        bus.put(topic, *topic.value(fields), payload)
 
     def cut(self, bus: MemoryBus) -> None:
         self.network.link_changed(bus.node, False)

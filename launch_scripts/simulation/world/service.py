@@ -16,7 +16,7 @@ from swarm.clock import NS_PER_S
 from swarm.liveness import HIGHEST_RANK, Roster, job_of, ranked_id
 from swarm.runtime.election import Candidacy
 from swarm.runtime.membership import Member
-from swarm.runtime.obedience import Obedience
+from swarm.runtime.order_client import OrderClient
 from swarm.runtime.role_setup import RoleSetup
 from swarm.runtime.stats import CAPTURES_BY, CAPTURES_OF
 from swarm.wire.messages.orders import Obey
@@ -87,7 +87,7 @@ class TargetsService:
             homes=load_homes(setup, terrain, truth),
             leads=self._candidacy.leads,
         )
-        self._obedience = Obedience(setup, bus, post, self._obeys)
+        self._obedience = OrderClient(setup, bus, post, self._obeys)
         self._obeyed_version: int | None = None
         self._anew, self._began_ns = setup.anew, setup.started_ns
         self._subscribed: set[str] = set()

@@ -30,7 +30,7 @@ from launch_scripts.web.health_pages import Process, health_pages, verdict
 from launch_scripts.web.health_probe import ask, fast
 from launch_scripts.web.http_server import MOST_CONNECTIONS, Server, refusal
 from swarm.errors import BusError, ConfigError
-from swarm.runtime.health import BOARD_BYTES, Board, Health, Phase, Vitals
+from swarm.runtime.loop_health import BOARD_BYTES, Board, Health, Phase, Vitals
 
 _NOW_NS = 100_000_000_000
 

@@ -25,7 +25,7 @@ from launch_scripts.process_table import ProcessSpec
 from swarm.config.scenario import Scenario
 from swarm.errors import BusError, ConfigError
 from swarm.grid import GridSpec
-from swarm.runtime.health import BOARD_BYTES, GENERATION_BEFORE, Board, Health
+from swarm.runtime.loop_health import BOARD_BYTES, GENERATION_BEFORE, Board, Health
 
 LAUNCHER = 100
 PREDECESSORS = {"router-0": 1, "keeper-0": 2, "planner-t0": 3, "planner-t1.r1": 4, "targets-0": 5, "agent-a0": 6}

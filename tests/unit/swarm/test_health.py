@@ -19,9 +19,9 @@ from swarm.bus.bus import AskEnded, Event, LinkChanged
 from swarm.bus.memory_bus import MemoryNetwork
 from swarm.bus.scheduler import Scheduler
 from swarm.clock import ManualClock, MonotonicClock
-from swarm.runtime import health as health_module
-from swarm.runtime.health import BOARD_BYTES, SLOT_BYTES, Board, Health, Phase, Supervisor, Vitals, supervisor_of
+from swarm.runtime import loop_health
 from swarm.runtime.inbox import Inbox
+from swarm.runtime.loop_health import Board, Health, Phase, Supervisor, Vitals, supervisor_of
 from swarm.runtime.membership import Member
 from swarm.runtime.process import Process
 from swarm.runtime.stats import READY, Counters
@@ -32,7 +32,7 @@ class Memory:
     """Counts the bytes that a writer may still write, and drops those beyond: it was killed there."""
 
     def __init__(self) -> None:
-        self.bytes = bytearray(BOARD_BYTES)
+        self.bytes = bytearray(loop_health.BOARD_BYTES)
         self.left = 1 << 30
 
     def __getitem__(self, at: slice) -> bytes:
@@ -53,7 +53,7 @@ vitals = st.builds(
 )
 
 
-@given(told=st.lists(vitals, min_size=1, max_size=6), last=vitals, cut=st.integers(0, SLOT_BYTES))
+@given(told=st.lists(vitals, min_size=1, max_size=6), last=vitals, cut=st.integers(0, loop_health.SLOT_BYTES))
 def test_a_reader_sees_a_whole_record_wherever_the_writer_was_killed(told, last, cut):
     memory = Memory()
     board = Board(memory)
@@ -76,8 +76,8 @@ def test_what_is_lacking_always_fits(lacks: list[str]) -> None:
 
 
 def test_nothing_was_written_where_there_are_zeros_or_rubbish() -> None:
-    assert Board(bytearray(BOARD_BYTES)).read() is None
-    assert Board(bytearray(os.urandom(BOARD_BYTES))).read() is None
+    assert Board(bytearray(loop_health.BOARD_BYTES)).read() is None
+    assert Board(bytearray(os.urandom(loop_health.BOARD_BYTES))).read() is None
 
 
 class Sleepy:
@@ -127,7 +127,7 @@ def until(board: Board, holds) -> Vitals:
 
 
 def test_a_loop_that_hangs_is_seen_from_another_thread(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(health_module, "HUNG_S", 0.5)
+    monkeypatch.setattr(loop_health, "HUNG_S", 0.5)
     service, health = Sleepy(), Health()
     assert health.board.read().phase is Phase.STARTS
     with running(service, health):

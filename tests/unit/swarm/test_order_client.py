@@ -8,8 +8,8 @@ import pytest
 from swarm.bus.bus import Asked, AskEnded, Heard, Replied
 from swarm.clock import NS_PER_S
 from swarm.config.scenario import Scenario
-from swarm.runtime.obedience import Obedience
 from swarm.runtime.order_book import GoalBook
+from swarm.runtime.order_client import OrderClient
 from swarm.runtime.role_setup import RoleSetup
 from swarm.wire.messages import Nothing
 from swarm.wire.messages.orders import Goals, Obey, Order, Orders, VehicleGoals
@@ -23,8 +23,8 @@ def bus() -> Mock:
     return Mock()
 
 
-def client_on(bus: Mock, **given: Any) -> Obedience:
-    return Obedience(RoleSetup(Scenario(), "r", "agent", "a0", 1, 0), bus, Mock(), **given)
+def client_on(bus: Mock, **given: Any) -> OrderClient:
+    return OrderClient(RoleSetup(Scenario(), "r", "agent", "a0", 1, 0), bus, Mock(), **given)
 
 
 def asked(topic: Any, request: Any, *, expired: bool = False) -> tuple[Asked, Mock]:

@@ -32,7 +32,7 @@ _ASKS = 10
 """Queries without a timely reply, although a process is there."""
 
 
-class Obedience:
+class OrderClient:
     """The orders that a process goes by, and the queries of operators that wait until it does.
 
     A process that starts asks keepers for their book. If none replies, it asks all; if no process replies, it goes
