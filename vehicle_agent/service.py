@@ -416,7 +416,9 @@ class AgentService:
 
     def _take_obstacles(self, now_ns: int) -> None:
         obstacles = self.agent.obstacles
-        for obstacle in self._collected(OBSTACLE, Obstacle):
+        # Of each sender only the newest counts in a tick: however many a stranger sends, the work is bounded.
+        reports = sorted(self._collected(OBSTACLE, Obstacle), key=lambda each: each.seq)
+        for obstacle in {(each.id, each.incarnation): each for each in reports}.values():
             obstacles.take_report(obstacle, now_ns)
             age_ns = now_ns - obstacle.stamp_ns
             if 0 <= age_ns < _LONGEST_AGE_NS:  # by clocks that agree
