@@ -176,7 +176,8 @@ class AgentService:
         bus.serve(LEAVE, post, agent=id)
 
     def handle(self, event: Event, now_ns: int) -> None:
-        if isinstance(event, LinkChanged) and event.up:
+        # Not for links beyond our router: of those anybody may tell, by a token, and no vehicle drives meanwhile.
+        if isinstance(event, LinkChanged) and event.up and not event.beyond:
             self.agent.obstacles.listen_anew(now_ns)
         if self._member.on_member_event(event) or self._sync.on_map_event(event, now_ns):
             return

@@ -22,8 +22,7 @@ def test_however_many_tokens_one_process_raises_only_its_newest_are_kept() -> No
     roster = Roster()
     for incarnation in range(1000, 0, -1):
         roster.appeared(Peer("agent", "a0", incarnation))
-    assert len(roster._alive["agent", "a0"]) == 64
-    assert roster.alive("agent") == {"a0": 1000}
+    assert (len(roster._alive["agent", "a0"]), roster.alive("agent")) == (64, {"a0": 1000})
     for incarnation in range(1000, 0, -1):
         roster.gone(Peer("agent", "a0", incarnation))
     assert not roster.is_alive("agent", "a0")
@@ -95,8 +94,6 @@ def test_no_single_message_outweighs_those_that_follow_for_longer_than_the_silen
     assert newest.is_news("t0", (1 << 61, 5), 2)
     assert not newest.is_news("t0", (7, 2), 1 + SILENCE_NS)
     assert newest.is_news("t1", (7, 2), 3)
-    assert newest.is_news("t0", (7, 3), 2 + SILENCE_NS)
-    assert not newest.is_news("t0", (7, 2), 3 + SILENCE_NS)
 
 
 def test_streams_beyond_the_most_are_always_news_and_take_no_memory() -> None:

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from support.agent_world import OPEN, AgentWorld, pace_of, scenario
 
+from swarm.bus.bus import LinkChanged
 from swarm.errors import ConfigError
 from swarm.wire.messages.processes import Stats
 from swarm.wire.messages.vehicles import Obstacle, VehicleState
@@ -61,6 +62,8 @@ def test_a_vehicle_that_an_obstacle_shuts_in_raises_an_alarm_until_the_obstacle_
     assert world.count("obstacles_refused") == 0, "a tick takes in one report of a sender"
     tell(51, 0.0)
     world.arrive(30)
+    world.agents["a0"].handle(LinkChanged(up=True, beyond=True), world.now_ns)
+    assert not world.agents["a0"].agent.obstacles.is_deaf, "tokens of routers, which anybody may raise, stop nobody"
     world.until(lambda: alarms() == [("a0-00", 10, False)])
     assert world.count("shut_in") == 1
 
