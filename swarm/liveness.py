@@ -73,6 +73,9 @@ SILENCE_NS = 3_000_000_000
 """A stream that has been silent for this time is heard again from wherever it goes on."""
 POSE_SILENCE_NS = 2_000_000_000
 """The same of target poses, which come twice a second at least."""
+FOR_GOOD_NS = 1 << 62
+"""The same of heartbeats: a process that starts again has another incarnation, so the numbers of one life never
+begin again."""
 
 
 class Newest:

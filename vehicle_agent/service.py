@@ -173,7 +173,8 @@ class AgentService:
         bus.serve(LEAVE, post, agent=id)
 
     def handle(self, event: Event, now_ns: int) -> None:
-        if isinstance(event, LinkChanged) and event.up:
+        # Not for links beyond our router: of those anybody may tell, by a token, and no vehicle drives meanwhile.
+        if isinstance(event, LinkChanged) and event.up and not event.beyond:
             self.agent.obstacles.listen_anew(now_ns)
         if self._member.on_member_event(event) or self._sync.on_map_event(event, now_ns):
             return
@@ -410,7 +411,9 @@ class AgentService:
 
     def _take_obstacles(self, now_ns: int) -> None:
         obstacles = self.agent.obstacles
-        for obstacle in self._collected(OBSTACLE, Obstacle):
+        # Of each sender only the newest counts in a tick: however many a stranger sends, the work is bounded.
+        reports = sorted(self._collected(OBSTACLE, Obstacle), key=lambda each: each.seq)
+        for obstacle in {(each.id, each.incarnation): each for each in reports}.values():
             obstacles.take_report(obstacle, now_ns)
             age_ns = now_ns - obstacle.stamp_ns
             if 0 <= age_ns < _LONGEST_AGE_NS:  # by clocks that agree

@@ -20,7 +20,7 @@ from swarm.clock import NS_PER_S
 from swarm.config.agent_plan import agent_of, crew_of
 from swarm.config.scenario import Scenario
 from swarm.grid import TILE_CELLS, GridSpec
-from swarm.liveness import HIGHEST_RANK, Peer, ranked_id, split_rank
+from swarm.liveness import FOR_GOOD_NS, HIGHEST_RANK, Newest, Peer, ranked_id, split_rank
 from swarm.runtime.order_book import OrderBook
 from swarm.runtime.stats import ENDED
 from swarm.runtime.tracker_ownership import Trackings
@@ -217,6 +217,8 @@ class LatestState(Counts):
         self._marks: dict[tuple[str, int], MarkSet] = {}
         self._ranks: dict[tuple[str, str], int] = {}
         """(role, job) -> rank of the process that leads, where there are standbys."""
+        self._beats = Newest(silence_ns=FOR_GOOD_NS)
+        """Detection of heartbeats which are newer than the last of their sender: copies change nothing."""
         self._alive: dict[tuple[str, str], set[int]] = {}
         """(role, id) -> incarnations whose token is up; empty for a process that was alive, of those that published
         counts or that the observer started."""
@@ -237,11 +239,13 @@ class LatestState(Counts):
             case PlannerStatus():
                 # Only the planner that leads tells one, and a standby that takes over may be the older process.
                 _remember(self.status, message.target, message)
-            case Heartbeat(leads=leads):
-                _remember(self.leads, (message.role, message.id), leads)
+            case Heartbeat(role=role, id=id, leads=leads) if self._beats.is_news(
+                (role, id), (message.incarnation, message.seq), now_ns
+            ):
+                _remember(self.leads, (role, id), leads)
                 if leads:
-                    job, rank = split_rank(message.id)
-                    _remember(self._ranks, (message.role, job), rank)
+                    job, rank = split_rank(id)
+                    _remember(self._ranks, (role, job), rank)
             case Fleet():
                 self.moved_ns = self.fleet_ns = max(self.moved_ns, now_ns)
                 fleet = self._fleets.get((message.author, message.region))

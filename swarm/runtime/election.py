@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 from swarm.bus.bus import Bus, Event, Heard, Post
 from swarm.clock import NS_PER_S
-from swarm.liveness import Newest, job_of, ranked_id, split_rank
+from swarm.liveness import FOR_GOOD_NS, Newest, job_of, ranked_id, split_rank
 from swarm.runtime.membership import Member
 from swarm.runtime.role_setup import RoleSetup
 from swarm.wire.messages.processes import Heartbeat
@@ -28,8 +28,6 @@ SETTLED_NS = 2 * NS_PER_S
 was just started has the whole map by then, and one that keeps stalling never comes so far."""
 _MOST_OTHERS = 64
 """Incarnations of other candidates that are remembered."""
-_FOR_GOOD_NS = 1 << 62
-"""A process that starts again has another incarnation, so the numbers of one life never begin again."""
 
 _Order = tuple[bool, int, int]
 """(not ready, rank, -incarnation): the lowest is best, so of one rank the younger incarnation."""
@@ -54,7 +52,9 @@ class Leadership:
     - A candidate that is better than the leader takes over once it has been so for `SETTLED_NS`, or for a lease if
       the leader is not ready.
     - A leader that stalls for a lease stops if another was ready to replace it.
-    - A heartbeat counts once: one that was copied, and is repeated with its code, holds no candidate back.
+    - A heartbeat counts once, and from `SETTLED_NS` after the first of its sender only if it names this candidate
+      as heard. Copies, which are repeated with their codes, therefore hold no candidate back, and one that starts
+      later only for that time.
 
     All periods are measured on a clock that counts at most half a lease between two ticks. While this process
     stalls, heartbeats of others wait unread, and no process is considered dead because of that.
@@ -80,13 +80,22 @@ class Leadership:
         """Time since when this candidate has been better than the leader; None if it is not."""
         self._others: dict[tuple[int, int], _Other] = {}
         """(rank, incarnation) -> its last heartbeat. Forgotten after a lease."""
-        self._newest = Newest(silence_ns=_FOR_GOOD_NS)
+        self._newest = Newest(silence_ns=FOR_GOOD_NS)
+        self.heard: dict[int, int] = {}
+        """Incarnation of another candidate -> when its first heartbeat came; those of the last 64 that were heard.
+        Our heartbeats name them."""
 
     def on_heartbeat(self, heartbeat: Heartbeat, now_ns: int) -> None:
         """Takes the heartbeat of another candidate."""
         rank = split_rank(heartbeat.id)[1]
         key = (rank, heartbeat.incarnation)
         if key == (self._rank, self._incarnation):
+            return
+        first_ns = self.heard.pop(heartbeat.incarnation, self._awake_ns)
+        self.heard[heartbeat.incarnation] = first_ns
+        if len(self.heard) > _MOST_OTHERS:
+            del self.heard[next(iter(self.heard))]
+        if self._incarnation not in heartbeat.heard and self._awake_ns - first_ns > SETTLED_NS:
             return
         if key not in self._others and len(self._others) >= _MOST_OTHERS:
             return
@@ -211,6 +220,7 @@ class Candidacy:
         setup = self._setup
         self._seq += 1
         heartbeat = Heartbeat(
-            role=setup.role, id=setup.id, incarnation=setup.incarnation, ready=ready, leads=leads, seq=self._seq
-        )
+            role=setup.role, id=setup.id, incarnation=setup.incarnation, ready=ready, leads=leads, seq=self._seq,
+            heard=list(self._core.heard),
+        )  # fmt: skip
         self._bus.publish(LEAD, heartbeat, role=setup.role, id=setup.id)

@@ -114,7 +114,8 @@ class Stats(Message, frozen=True, kw_only=True, tag=schema_of("stats")):
 
 class Heartbeat(Message, frozen=True, kw_only=True, tag=schema_of("beat")):
     """State of a candidate for one job, such as a planner or a standby. `ready`: it can do the job. `leads`: it
-    does. `seq`: number of this heartbeat in its sender's life; only a greater one counts."""
+    does. `seq`: number in its sender's life; only a greater one counts. `heard`: incarnations whose heartbeats its
+    sender has received."""
 
     role: Id
     id: Id
@@ -122,6 +123,7 @@ class Heartbeat(Message, frozen=True, kw_only=True, tag=schema_of("beat")):
     ready: bool
     leads: bool
     seq: Natural
+    heard: Annotated[list[Incarnation], Meta(max_length=64)] = []
 
 
 class Note(Message, frozen=True, kw_only=True, tag=schema_of("note")):

@@ -294,8 +294,8 @@ def test_a_line_says_which_standby_leads_and_whether_any_planner_is_there() -> N
     def titles() -> list[str]:
         return [line.title for line in recorder.summary(0).targets]
 
-    def heartbeat(id: str, leads: bool) -> Heartbeat:
-        return Heartbeat(role="planner", id=id, incarnation=1, ready=True, leads=leads, seq=1)
+    def heartbeat(id: str, leads: bool, seq: int = 1) -> Heartbeat:
+        return Heartbeat(role="planner", id=id, incarnation=1, ready=True, leads=leads, seq=seq)
 
     assert titles() == ["t0 (planner down)", "t1 (planner down)"]
     begun = Recorder(standing_by, GRID, 1)
@@ -306,9 +306,9 @@ def test_a_line_says_which_standby_leads_and_whether_any_planner_is_there() -> N
     hear(recorder, heartbeat("t0", True), heartbeat("t0.r1", False), heartbeat("t1", True))
     assert titles() == ["t0", "t1"]
     recorder.alive(Peer("planner", "t0", 1), False, 0)
-    hear(recorder, heartbeat("t0.r1", True))
+    hear(recorder, heartbeat("t0.r1", True, 2), heartbeat("t0", True))
     assert titles() == ["t0 (standby 1)", "t1"]
-    hear(recorder, heartbeat("t0.r1", False), heartbeat("t0", True))
+    hear(recorder, heartbeat("t0.r1", False, 3), heartbeat("t0", True, 2))
     assert titles() == ["t0", "t1"]
 
 

@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 from support.agent_world import OPEN, AgentWorld, pace_of, scenario
 
+from swarm.bus.bus import LinkChanged
 from swarm.errors import ConfigError
 from swarm.wire.messages.processes import Stats
 from swarm.wire.messages.vehicles import Obstacle, VehicleState
@@ -45,8 +46,8 @@ def test_a_vehicle_that_an_obstacle_shuts_in_raises_an_alarm_until_the_obstacle_
     stats: list[Stats] = []
     world.bus("observer").subscribe(STATS, lambda event: stats.append(event.message))  # type: ignore[union-attr, arg-type]
 
-    def tell(seq: int, lease_s: float) -> None:
-        obstacle = Obstacle(id="p", incarnation=1, seq=seq, x_m=x_m, y_m=y_m, radius_m=1.0, lease_s=lease_s)
+    def tell(seq: int, lease_s: float, x: float = x_m) -> None:
+        obstacle = Obstacle(id="p", incarnation=1, seq=seq, x_m=x, y_m=y_m, radius_m=1.0, lease_s=lease_s)
         person.publish(OBSTACLE, obstacle, id="p")
 
     def alarms() -> list[tuple[str, int | None, bool]]:
@@ -54,11 +55,15 @@ def test_a_vehicle_that_an_obstacle_shuts_in_raises_an_alarm_until_the_obstacle_
         return [(each.about, each.cell, each.over_ns is None) for each in told if each.kind == "shut-in"]
 
     world.start_all()
-    tell(1, 10.0)
+    for seq in range(1, 51):
+        tell(seq, 10.0, x_m + 40.0 * (seq % 2))  # leaps, of which only the last counts
     world.until(alarms, within_s=10)
     assert alarms() == [("a0-00", 10, True)]
-    tell(2, 0.0)
+    assert world.count("obstacles_refused") == 0, "a tick takes in one report of a sender"
+    tell(51, 0.0)
     world.arrive(30)
+    world.agents["a0"].handle(LinkChanged(up=True, beyond=True), world.now_ns)
+    assert not world.agents["a0"].agent.obstacles.is_deaf, "tokens of routers, which anybody may raise, stop nobody"
     world.until(lambda: alarms() == [("a0-00", 10, False)])
     assert world.count("shut_in") == 1
 
