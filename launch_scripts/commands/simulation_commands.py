@@ -67,7 +67,7 @@ def simulate(
     seconds   Simulated seconds.
     trace     Write the event log here; the same seed writes the same log.
     """
-    from launch_scripts.report.exporter import check_target
+    from launch_scripts.report.gis_formats import check_target
 
     if seeds is None:
         if scenario is None:
