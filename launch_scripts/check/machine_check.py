@@ -15,6 +15,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from launch_scripts.check import Finding, Level, failure, warning
+from launch_scripts.deploy.machines_needed import Estimate, swarm_of
 from launch_scripts.observe.run_folder import version_of
 from launch_scripts.process_table import processes_of
 from swarm.config.agent_plan import PLACE_TREES_BYTES, place_trees_bytes, places_of, plan_agents
@@ -34,12 +35,6 @@ _UNSYNCHRONISED = 5
 _TIMEX_BYTES = 256
 """Above the size of Linux's `struct timex`, 208 bytes on 64-bit machines: the kernel writes all of it."""
 
-# docs/method/measurements.md: 300 to 3,000 vehicles of five or six agents on two quiet cores at 5 Hz. The rule of
-# thumb: agents, vehicles and trees cost in proportion to ticks and numbers.
-_AGENT_CORES_AT_5_HZ = 0.022
-_VEHICLE_CORES_AT_5_HZ = 0.31 / 1000
-_PLANNER_CORES = 0.011
-_OTHERS_CORES = 0.135
 _PROCESS_BYTES = 31 << 20
 _VEHICLE_BYTES = 100 << 10
 _TREE_CELL_BYTES = 24
@@ -56,7 +51,7 @@ _MOST_BYTES = 1 << 60
 bits."""
 
 
-class Machine(NamedTuple):
+class Resources(NamedTuple):
     """Resources of this machine: processor cores, and free bytes of memory and of the disk of a folder of runs."""
 
     cores: int
@@ -64,25 +59,27 @@ class Machine(NamedTuple):
     disk_bytes: int
 
 
-class Needs(NamedTuple):
+class RunNeeds(NamedTuple):
     """Estimated needs of a scenario.
 
-    cores       that are busy all the time
-    disk_bytes  in the folder of the run
+    cores            that are busy all the time
+    planner_cores    of these, cores of one planner
+    disk_bytes       in the folder of the run
     recording_bytes  of these, bytes written while the run lasts
     """
 
     processes: int
     agents: int
     cores: float
+    planner_cores: float
     memory_bytes: int
     disk_bytes: int
     recording_bytes: int
 
 
-def this_machine(runs: Path) -> Machine:
+def this_machine(runs: Path) -> Resources:
     """Returns the resources of this machine, with the disk of a folder of runs."""
-    return Machine(len(os.sched_getaffinity(0)), available_bytes(), shutil.disk_usage(_nearest(runs)).free)
+    return Resources(len(os.sched_getaffinity(0)), available_bytes(), shutil.disk_usage(_nearest(runs)).free)
 
 
 def available_bytes() -> int:
@@ -92,12 +89,11 @@ def available_bytes() -> int:
     return int(psutil.virtual_memory().available)
 
 
-def needs_of(scenario: Scenario, cells: int) -> Needs:
+def needs_of(scenario: Scenario, cells: int) -> RunNeeds:
     """Returns the needs of a scenario on a terrain of `cells` cells."""
-    vehicles, ticks = scenario.vehicle_count, scenario.vehicles.tick_hz / 5
+    vehicles, standbys = scenario.vehicle_count, scenario.standbys.planner
     agents, processes = len(plan_agents(scenario)), len(processes_of(scenario))
-    trees = len(scenario.target_ids) * (1 + scenario.standbys.planner)
-    moving = ticks * (agents * _AGENT_CORES_AT_5_HZ + vehicles * _VEHICLE_CORES_AT_5_HZ)
+    trees = len(scenario.target_ids) * (1 + standbys)
     memory = (
         processes * _PROCESS_BYTES + vehicles * _VEHICLE_BYTES + cells * (_CELL_BYTES + trees * _TREE_CELL_BYTES)
     )
@@ -105,11 +101,13 @@ def needs_of(scenario: Scenario, cells: int) -> Needs:
     kept = place_trees_bytes(PLACE_TREES_BYTES, classes, cells)
     memory += len(places_of(scenario)) * classes * (kept + cells * _TREE_CELL_BYTES)
     recording = int(min(scenario.seconds / 60 * _RECORDING_BYTES_PER_MINUTE, _MOST_BYTES))
-    cores = moving + trees * _PLANNER_CORES + _OTHERS_CORES
-    return Needs(processes, agents, cores, memory, cells * _CELL_BYTES + recording, recording)
+    taken = Estimate(swarm_of(scenario, cells), standbys).on(1)
+    cores, planner_cores = sum(taken.cpu_cores.values()), taken.process["planner"]
+    disk = cells * _CELL_BYTES + recording
+    return RunNeeds(processes, agents, cores, planner_cores, memory, disk, recording)
 
 
-def against(scenario: Scenario, needs: Needs, here: Machine, runs: Path) -> Iterator[Finding]:
+def against(scenario: Scenario, needs: RunNeeds, here: Resources, runs: Path) -> Iterator[Finding]:
     """Yields findings for each resource of which the machine has less than a run needs."""
     if needs.cores > _BUSY_SHARE * here.cores:
         hz = scenario.vehicles.tick_hz
@@ -139,13 +137,14 @@ def against(scenario: Scenario, needs: Needs, here: Machine, runs: Path) -> Iter
         yield failure("runs", complaint)
 
 
-def why_no_room(scenario: Scenario, cells: int, planners: int, here: Machine) -> str | None:
+def why_no_room(scenario: Scenario, cells: int, planners: int, here: Resources) -> str | None:
     """Reason why this machine cannot carry planners beside a scenario; None if it can.
 
     A quarter of its cores is for such planners, even where the scenario needs the others.
     """
-    share = max(_BUSY_SHARE * here.cores - needs_of(scenario, cells).cores, (1 - _BUSY_SHARE) * here.cores)
-    if planners > (most := int(share / _PLANNER_CORES)):
+    needs = needs_of(scenario, cells)
+    share = max(_BUSY_SHARE * here.cores - needs.cores, (1 - _BUSY_SHARE) * here.cores)
+    if planners > (most := int(share / needs.planner_cores)):
         return f"{planners} planners of added targets, and this machine of {here.cores} cores carries {most}"
     if (wanted := _PROCESS_BYTES + cells * _TREE_CELL_BYTES) > here.free_bytes:
         return f"it needs about {size(wanted)} of memory, and {size(here.free_bytes)} are free"

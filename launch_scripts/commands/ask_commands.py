@@ -6,7 +6,7 @@ import json
 import os
 from importlib.resources import files
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import typer
 
@@ -22,9 +22,6 @@ from launch_scripts.commands.shared_options import (
 )
 from launch_scripts.typer_commands import ASK, command
 from swarm.errors import ConfigError
-
-if TYPE_CHECKING:
-    from swarm.config.scenario import NetworkConfig
 
 app = typer.Typer()
 _TURN_S = 0.1
@@ -108,11 +105,11 @@ def status(where: Where, watch: bool = False, as_json: AsJson = False) -> None:
 
     watch  Show processes once a second, as `swarm top`.
     """
-    from launch_scripts.commands.status_view import ask_status, print_status, show_top, status_fields
+    from launch_scripts.commands.status_view import ask_status, print_status, status_fields
     from launch_scripts.launcher.terminal_tables import whole_output
 
     if watch:
-        show_top(where, each=False, once=False, as_json=as_json)
+        top(where, as_json=as_json)
     elif as_json:
         typer.echo(json.dumps(status_fields(ask_status(where)), indent=2))
     else:
@@ -186,26 +183,19 @@ def metrics(
     if dashboard or alerts:
         name = "dashboard.json" if dashboard else "alerts.yml"
         typer.echo(files("launch_scripts.web").joinpath(name).read_text(encoding="utf-8"), nl=False)
-    else:
-        _serve_metrics(where.network(), port, signals_address)
-
-
-def _serve_metrics(network: NetworkConfig, port: int, address: str) -> None:
-    """Serves until Ctrl-C, on an address of this machine. Raises BusError if the port is taken, or there is no
-    router."""
+        return
     from launch_scripts.observe.run_observer import OutsideObserver
     from launch_scripts.web.health_verdict import Process
     from launch_scripts.web.prometheus import MetricsEndpoint, families
-    from swarm.bus.zenoh_bus import open_bus
     from swarm.clock import MonotonicClock
     from swarm.runtime.health import Health, supervisor_of
     from swarm.wire.topics import STATS, STATUS
 
     health = Health(supervisor=supervisor_of(os.environ))
     health.begins(1.0 / _TURN_S)
-    endpoint = MetricsEndpoint(port, lambda: [Process("metrics", health.board.read())], address)
+    endpoint = MetricsEndpoint(port, lambda: [Process("metrics", health.board.read())], signals_address)
     try:
-        with open_bus(network) as bus:
+        with where.bus() as bus:
             clock, observer = MonotonicClock(), OutsideObserver(bus, topics={STATS: 0.0, STATUS: 0.0}, follows=True)
 
             def figures() -> list[Any]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import math
 import re
 from functools import partial
 from pathlib import Path
@@ -22,13 +21,13 @@ from launch_scripts.deploy.hosts import load_hosts
 from launch_scripts.deploy.kits import CERTIFICATES, keepers_before, write_kits
 from launch_scripts.deploy.machine_plan import Plan, make_plan, plan_fields
 from launch_scripts.deploy.machines_needed import (
-    CELLS_PER_VEHICLE,
+    LEAST_SIDE,
     Estimate,
     Machine,
-    Needs,
     Swarm,
     fewest_machines,
     reaches,
+    side_of,
     too_much,
 )
 from launch_scripts.deploy.service_files import compose_files, systemd_files, zenohd_config
@@ -52,9 +51,8 @@ KitName = Literal["systemd", "compose"]
 Days = Annotated[int, typer.Option(min=1, max=3650)]
 _IMAGE = r"[A-Za-z0-9][A-Za-z0-9_.:/-]{0,251}:[A-Za-z0-9_][A-Za-z0-9_.-]{0,123}"
 """With a tag, which "-all" may be added to: no digest."""
-_LEAST_SIDE, _MOST_SIDE = 32, 16_384
-"""Cells of a side: one tile of marks (`TILE_CELLS`), and the largest terrain that a scenario may have
-(docs/reference/limits.md)."""
+_MOST_SIDE = 16_384
+"""Cells of a side of the largest terrain that a scenario may have (docs/reference/limits.md)."""
 
 
 @command(app)
@@ -181,13 +179,10 @@ def size(
     link       Link of a machine, Mbit/s.
     as_json    Print one JSON object instead of tables.
     """
-    least = max(_LEAST_SIDE**2, 4 * vehicles)
+    least = max(LEAST_SIDE**2, 4 * vehicles)
     if cells is not None and not least <= cells <= _MOST_SIDE**2:
         raise ConfigError(f"--map is {cells}, expected {least} to {_MOST_SIDE**2} cells for {vehicles} vehicles")
-    side = max(round(math.sqrt(CELLS_PER_VEHICLE * vehicles)), _LEAST_SIDE)
-    if cells is not None:
-        side = math.isqrt(cells - 1) + 1
-    agents = -(-vehicles // per_agent)
+    side, agents = side_of(vehicles, cells), -(-vehicles // per_agent)
     swarm = Swarm(vehicles=vehicles, targets=targets, agents=agents, side=side, tick_hz=tick_hz)
     machine = Machine(cores, memory, link)
     found = fewest_machines(Estimate(swarm, standbys), machine)
@@ -196,29 +191,25 @@ def size(
     if as_json:
         typer.echo(json.dumps({**msgspec.to_builtins(found), "full": full, "extrapolated": beyond}))
     else:
-        _show_size(found)
+        table = columns("Needs of this swarm", number_of(found.machines, "machine"))
+        for name, value in (
+            ("cores, all machines", sum(found.cpu_cores.values())),
+            *((f"  {role}", each) for role, each in found.cpu_cores.items()),
+            ("cores, a machine", found.machine_cores),
+            ("cores, the first", found.first_cores),
+            ("memory, a machine, GB", found.memory_gb),
+            ("memory, the first, GB", found.first_memory_gb),
+            ("link of a machine, in, Mbit/s", found.link_mbit_per_s),
+            ("link of the first, in, Mbit/s", found.first_link_mbit_per_s),
+            ("sessions of a router", found.sessions),
+        ):
+            table.add_row(name, f"{value:,.3g}" if value < 100 else f"{value:,.0f}")
+        Console(highlight=False).print(table)
         for each in full:
             typer.echo(f"{each}: more machines do not help.")
         if beyond:
             typer.echo("Extrapolated: larger than the swarms that were measured.")
     return int(bool(full))
-
-
-def _show_size(found: Needs) -> None:
-    table = columns("Needs of this swarm", number_of(found.machines, "machine"))
-    for name, value in (
-        ("cores, all machines", sum(found.cpu_cores.values())),
-        *((f"  {role}", each) for role, each in found.cpu_cores.items()),
-        ("cores, a machine", found.machine_cores),
-        ("cores, the first", found.first_cores),
-        ("memory, a machine, GB", found.memory_gb),
-        ("memory, the first, GB", found.first_memory_gb),
-        ("link of a machine, in, Mbit/s", found.link_mbit_per_s),
-        ("link of the first, in, Mbit/s", found.first_link_mbit_per_s),
-        ("sessions of a router", found.sessions),
-    ):
-        table.add_row(name, f"{value:,.3g}" if value < 100 else f"{value:,.0f}")
-    Console(highlight=False).print(table)
 
 
 @command(app)

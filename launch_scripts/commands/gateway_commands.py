@@ -20,7 +20,6 @@ from swarm.errors import BusError, ConfigError
 from swarm.places import read_place
 
 if TYPE_CHECKING:
-    from launch_scripts.gateways.ros2.gateway_settings import Settings
     from swarm.client import Swarm
     from swarm.config.scenario import NetworkConfig
 
@@ -70,14 +69,7 @@ def ros2(
     where = replace(where, connect=where.connect or ours.connect, namespace=where.namespace or ours.namespace)
     if where.tls_ca is None and where.tls_dir is None:
         where = replace(where, tls_ca=ours.ca, tls_cert=ours.certificate, tls_key=ours.key)
-    _serve_ros2(chosen, where.network(), where.runs or RUNS)
-
-
-def _serve_ros2(settings: Settings, network: NetworkConfig, runs: Path) -> None:
-    """Forwards until Ctrl-C. Raises BusError if one of the two sides does not answer at the start."""
-    from launch_scripts.gateways.ros2.service import serve
-
-    ros = settings.ros.endpoint
+    network, ros, runs = where.network(), chosen.ros.endpoint, where.runs or RUNS
     if ros in network.connect:
         typer.echo(
             f"the swarm and ROS have one router, {ros}: ROS nodes there can say and hear all that the swarm does. "
@@ -86,8 +78,10 @@ def _serve_ros2(settings: Settings, network: NetworkConfig, runs: Path) -> None:
         )
     if not listening(ros):
         raise BusError(f"no router of the ROS side listens at {ros}: start rmw_zenohd, or name it by --ros")
+    from launch_scripts.gateways.ros2.service import serve
+
     with stop_requests() as stopping, suppress(KeyboardInterrupt):
-        serve(settings, lambda: _join(network), runs, lambda sentence: typer.echo(sentence, err=True), stopping)
+        serve(chosen, lambda: _join(network), runs, lambda sentence: typer.echo(sentence, err=True), stopping)
 
 
 def _join(network: NetworkConfig) -> Swarm:

@@ -161,11 +161,6 @@ def factors(where: Where, store: Annotated[Path | None, typer.Argument()] = None
     else:
         with where.bus() as bus:
             words = ask_learned(bus, where)
-    print_learned(words, as_json=as_json)
-
-
-def print_learned(words: Sequence[MarkSet], *, as_json: bool) -> None:
-    """Prints the learned factor of each kind of ground."""
     kinds = learned_kinds(words)
     if as_json:
         print(json.dumps({"kinds": [each._asdict() for each in kinds]}, indent=2))

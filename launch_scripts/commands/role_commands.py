@@ -66,7 +66,7 @@ class Own:
     id          An agent, such as a0; a router or keeper is 0 unless there are several.
     target      Of a planner: the target whose tree it keeps, such as t0.
     group       Of places: the group whose vehicles ask, as the scenario names it.
-    rank        Of planner, places, targets: 0 leads; 1 takes over when it has failed; and so on (`standbys`).
+    rank        Of planner, places, targets: 0 is the leader; 1 takes over when it fails; and so on (`standbys`).
     listen      Of a router: the endpoint to listen at, such as tls/0.0.0.0:7447.
     store_path  Of a keeper: the SQLite file of marks; if not given, RUNS/RUN_ID/map.sqlite.
     rebuild     Of a keeper: move a damaged store aside and fill a new one from the swarm.

@@ -14,18 +14,17 @@ from typing import TYPE_CHECKING, Annotated
 import msgspec
 import typer
 
-from launch_scripts.commands.shared_options import AsJson, Runs, Seconds, Seed
+from launch_scripts.commands.shared_options import AsJson, Force, Runs, Seconds, Seed
 from launch_scripts.plain_text import number_of
 from launch_scripts.stop_requests import stop_requests
 from launch_scripts.typer_commands import RUN, command, complete_scenarios, family_app
 from swarm.config.input_files import quoted
-from swarm.errors import ConfigError, StoreError
+from swarm.errors import ConfigError
 from swarm.files import writing
 
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from launch_scripts.simulation.study.summary import Summary
     from launch_scripts.simulation.study.sweep import Sweep
     from launch_scripts.simulation.trials import Result, Trial
 
@@ -45,6 +44,7 @@ def simulate(
     seconds: Seconds = None,
     runs: Runs = Path("runs"),
     trace: Path | None = None,
+    force: Force = False,
     as_json: AsJson = False,
 ) -> int:
     """Simulate a scenario in one process, faster than real time.
@@ -67,11 +67,12 @@ def simulate(
     seconds   Simulated seconds.
     trace     Write the event log here; the same seed writes the same log.
     """
+    from launch_scripts.report.exporter import check_target
+
     if seeds is None:
         if scenario is None:
             raise ConfigError("give a SCENARIO, or --seeds A:B to try many seeds of small worlds")
-        if trace is not None and trace.is_file():
-            raise ConfigError(f"--trace {trace}: the file exists; name another")
+        check_target(trace, "--trace", force=force)
         _simulate_once(scenario, seed, seconds, trace, runs, as_json)
         return 0
     if seed is not None or trace is not None:
@@ -98,8 +99,8 @@ def _simulate_once(
     with contextlib.ExitStack() as stack:
         log = None
         if trace is not None:
-            with writing(trace):
-                log = stack.enter_context(trace.open("w", encoding="utf-8", newline="\n"))
+            stack.enter_context(writing(trace))
+            log = stack.enter_context(trace.open("w", encoding="utf-8", newline="\n"))
         scenario = msgspec.structs.replace(
             scenario,
             seed=scenario.seed if seed is None else seed,
@@ -128,8 +129,6 @@ def _simulate_once(
         f"{scenario.seconds / took_s:.1f} times real time, {done.log.deliveries:,} deliveries{log_told}"
     )
     terminal.say(f"report: {folder / 'report.html'}, numbers: {folder / 'report.json'}")
-    if done.log.cut is not None:
-        raise StoreError(f"the event log {trace} has no end: {done.log.cut}")
 
 
 def simulate_seeds(name: str | None, seeds: str, seconds: float | None, as_json: bool) -> bool:
@@ -225,7 +224,8 @@ def sweep_study(name: str, scheduler: str | None, workers: int | None, out: Path
     from dask.system import CPU_COUNT
 
     from launch_scripts.simulation.study.study import study_path
-    from launch_scripts.simulation.study.sweep import NUMBERS, Sweep
+    from launch_scripts.simulation.study.summary import METHOD, outcome_table
+    from launch_scripts.simulation.study.sweep import NUMBERS, RESULTS, Sweep
 
     sweep = Sweep(study_path(name), out)
     console = Console(stderr=True, highlight=False, soft_wrap=True, markup=False, emoji=False)
@@ -244,8 +244,14 @@ def sweep_study(name: str, scheduler: str | None, workers: int | None, out: Path
     summary = sweep.finish()
     if as_json:
         typer.echo((sweep.folder / NUMBERS).read_text(encoding="utf-8"))
-    else:
-        _print_summary(summary, sweep.folder)
+        return not summary.failing and not summary.missing
+    for name in summary.cases[0].outcomes:
+        typer.echo(f"{name}\n{outcome_table(summary, name)}\n")
+    for failure in summary.failing[:_SHOWN_FAILURES]:
+        typer.echo(f"failed: {failure.replay}")
+    missing = f"; {summary.missing:,} have no result" if summary.missing else ""
+    typer.echo(f"{len(summary.failing):,} of {summary.trials:,} trials broke a law{missing}")
+    typer.echo(f"{METHOD}\nsummary: {sweep.folder / NUMBERS}, results: {sweep.folder / RESULTS}")
     return not summary.failing and not summary.missing
 
 
@@ -268,16 +274,3 @@ def _run(sweep: Sweep, console: Console, workers: int, scheduler: str | None, st
                 raise KeyboardInterrupt
 
         sweep.run(workers, scheduler, told)
-
-
-def _print_summary(summary: Summary, folder: Path) -> None:
-    from launch_scripts.simulation.study.summary import METHOD, outcome_table
-    from launch_scripts.simulation.study.sweep import NUMBERS, RESULTS
-
-    for name in summary.cases[0].outcomes:
-        typer.echo(f"{name}\n{outcome_table(summary, name)}\n")
-    for failure in summary.failing[:_SHOWN_FAILURES]:
-        typer.echo(f"failed: {failure.replay}")
-    missing = f"; {summary.missing:,} have no result" if summary.missing else ""
-    typer.echo(f"{len(summary.failing):,} of {summary.trials:,} trials broke a law{missing}")
-    typer.echo(f"{METHOD}\nsummary: {folder / NUMBERS}, results: {folder / RESULTS}")

@@ -126,8 +126,10 @@ def print_status(status: Status, console: Console) -> None:
     if silent := status.silent:
         say(unanswered(silent, len(silent) + len(status.members), _MOST_S), "yellow")
     console.print(_processes(status))
-    if (spoken := _wire_versions(status)) is not None:
-        say(spoken)
+    newest = max(info.wire_version for info in status.members)
+    if older := [info for info in status.members if info.wire_version < newest]:
+        names = ", ".join(f"{info.role}-{info.id}" for info in older)
+        say(f"an upgrade is under way: wire version {newest}, but {older[0].wire_version} of {names}")
     for line in facts.alarm_lines(state, _SHOWN_ALARMS, over=True):
         say(line, "yellow")
     if state.targets:
@@ -155,16 +157,6 @@ def _progress(goal: GoalState, frame: MapFrame | None) -> str:
         place = f" to {written(frame, goal.cell)}"
     why = f" ({goal.reason})" if goal.reason else ""
     return f"{goal.state}{place}{why}, {goal.done} reached"
-
-
-def _wire_versions(status: Status) -> str | None:
-    """Returns which processes speak an older wire version than others, in words; None where all speak one."""
-    newest = max(info.wire_version for info in status.members)
-    older = [info for info in status.members if info.wire_version < newest]
-    if not older:
-        return None
-    names = ", ".join(f"{info.role}-{info.id}" for info in older)
-    return f"an upgrade is under way: wire version {newest}, but {older[0].wire_version} of {names}"
 
 
 def _processes(status: Status) -> Table:

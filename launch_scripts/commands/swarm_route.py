@@ -7,7 +7,7 @@ import math
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 import typer
@@ -22,12 +22,15 @@ from swarm.places import Place, cell_of, fields_of, written
 from swarm.runtime.operator import replies_to
 from swarm.wire.access import OPERATOR
 from swarm.wire.codec import encode_json
+from swarm.wire.messages import Message
 from swarm.wire.messages.planning import PlaceRouteReply, PlaceRouteRequest, RouteReply, RouteRequest
 from swarm.wire.route_columns import Route, RouteStatus, TargetStatus
-from swarm.wire.topics import PLACE_ROUTE, ROUTE, asker_of
+from swarm.wire.topics import PLACE_ROUTE, ROUTE, Topic, asker_of
 
 if TYPE_CHECKING:
     from swarm.bus.bus import Bus
+
+M = TypeVar("M", bound=Message)
 
 _TIMEOUT_S = 5.0
 """A planner answers within 1 s, or says that it has no tree; five times that is for a busy machine, as for plans of
@@ -95,15 +98,10 @@ def ask_planner(bus: Bus, where: object, target: str, start: Place, vehicle_clas
     row, col = frame.grid.row_col(cell)
     request = RouteRequest(row=row, col=col, vehicle_class=vehicle_class)
     began_s = time.monotonic()
-    asker = asker_of(OPERATOR, "command")
-    replies, failure = replies_to(bus, ROUTE, request, _TIMEOUT_S, target=target, asker=asker)
-    took_ms = (time.monotonic() - began_s) * 1e3
-    for reply in replies:
-        if isinstance(reply, RouteReply):
-            return Answer(reply, frame, cell, took_ms)
-    if failure is not None and failure != "timeout":
-        raise ConfigError(failure)
-    raise BusError(f"no planner of target {target!r} answers {where}")
+    reply = _reply(
+        bus, ROUTE, request, RouteReply, f"no planner of target {target!r} answers {where}", target=target
+    )
+    return Answer(reply, frame, cell, (time.monotonic() - began_s) * 1e3)
 
 
 def ask_place(bus: Bus, where: object, start: Place, end: Place, vehicle_class: str) -> Answer:
@@ -111,16 +109,11 @@ def ask_place(bus: Bus, where: object, start: Place, end: Place, vehicle_class: 
     frame = frame_of_run(bus, where)
     cell, goal = cell_of(start, frame, "--from"), cell_of(end, frame, "--to")
     request = PlaceRouteRequest(to=goal, cells=[cell], vehicle_class=vehicle_class)
+    missing = f"no process plans routes to places {where}: its scenario needs planner.places = true"
     began_s = time.monotonic()
     while True:
-        asker = asker_of(OPERATOR, "command")
-        replies, failure = replies_to(bus, PLACE_ROUTE, request, _TIMEOUT_S, asker=asker)
+        found = _reply(bus, PLACE_ROUTE, request, PlaceRouteReply, missing)
         spent_s = time.monotonic() - began_s
-        found = next((reply for reply in replies if isinstance(reply, PlaceRouteReply)), None)
-        if found is None and failure not in (None, "timeout"):
-            raise ConfigError(failure)
-        if found is None:
-            raise BusError(f"no process plans routes to places {where}: its scenario needs planner.places = true")
         if found.status != "growing" or spent_s > _TIMEOUT_S:
             break
     if found.status != "ok":
@@ -131,6 +124,18 @@ def ask_place(bus: Bus, where: object, start: Place, end: Place, vehicle_class: 
         vehicle_class=vehicle_class,
     )  # fmt: skip
     return Answer(reply, frame, cell, spent_s * 1e3)
+
+
+def _reply(bus: Bus, topic: Topic, request: Message, kind: type[M], missing: str, **fields: Any) -> M:
+    """The reply of this kind to a question. Raises ConfigError if it is refused, BusError(missing) without one."""
+    asker = asker_of(OPERATOR, "command")
+    replies, failure = replies_to(bus, topic, request, _TIMEOUT_S, asker=asker, **fields)
+    for reply in replies:
+        if isinstance(reply, kind):
+            return reply
+    if failure is not None and failure != "timeout":
+        raise ConfigError(failure)
+    raise BusError(missing)
 
 
 def as_json(answer: Answer) -> str:
@@ -215,20 +220,14 @@ def show(answer: Answer) -> None:
     age_s = reply.tree_age_ms / 1e3
     grown = "" if reply.target == _PLACE else f"tree grown whole {age_s:.1f} s ago and kept up since, "
     typer.echo(f"{grown}map version {reply.map_version}, answered in {answer.took_ms:.1f} ms")
-    _show_pose(reply)
+    # How old the pose is by which the planner answers.
+    if reply.pose_age_s is not None and reply.tracker_lost:
+        where = f"{reply.target} is lost: it has no tracker, and this is its position {reply.pose_age_s:.1f} s ago"
+        typer.secho(where, fg="yellow")
+    elif reply.pose_age_s is not None:
+        typer.echo(f"pose {reply.pose_age_s:.1f} s old")
 
 
 def _target(answer: Answer) -> str:
     cell = answer.target_cell
     return answer.reply.target if cell is None else f"{answer.reply.target} at {written(answer.frame, cell)}"
-
-
-def _show_pose(reply: RouteReply) -> None:
-    """Say how old the pose is that the answer goes by."""
-    if reply.pose_age_s is None:
-        return
-    if reply.tracker_lost:
-        where = f"{reply.target} is lost: it has no tracker, and this is its position {reply.pose_age_s:.1f} s ago"
-        typer.secho(where, fg="yellow")
-    else:
-        typer.echo(f"pose {reply.pose_age_s:.1f} s old")

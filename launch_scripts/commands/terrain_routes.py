@@ -395,11 +395,7 @@ def write_reach(found: Reach, path: Path, every_s: float | None, slack: float) -
     many = (found.quantiles_s()[1] - (found.fastest_s or 0.0)) / every_s
     if many > _MOST_BANDS:
         raise ConfigError(f"--every-s {every_s:g} makes {many:.0f} areas, at most {_MOST_BANDS}: ask for fewer")
-    write_layers(path, [_areas(found, every_s)], MapFrame(found.grid))
-
-
-def _areas(found: Reach, every_s: float) -> Layer:
-    """Areas between lines of equal time; of a corridor, of equal time lost against the best way."""
+    # Areas between lines of equal time; of a corridor, of equal time lost against the best way.
     known = np.isfinite(found.seconds)
     above_s = np.where(known, found.seconds - np.float32(found.fastest_s or 0.0), 0)
     bands: NDArray[np.int32] = np.maximum(np.floor(above_s / every_s), 0).astype(np.int32)
@@ -407,4 +403,5 @@ def _areas(found: Reach, every_s: float) -> Layer:
         Feature(rings, {"from_s": band * every_s, "to_s": (band + 1) * every_s})
         for band, rings in areas_of(bands, known, found.grid)
     ]
-    return Layer("reach", "Polygon", {"from_s": "real", "to_s": "real"}, areas, COSTS)
+    layer = Layer("reach", "Polygon", {"from_s": "real", "to_s": "real"}, areas, COSTS)
+    write_layers(path, [layer], MapFrame(found.grid))

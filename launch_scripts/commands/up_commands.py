@@ -77,7 +77,7 @@ class SomeProcesses:
     """Part of a swarm that a launcher starts, and its run.
 
     only       Start only this role or process: planner, planner.t0.r1; may be given several times.
-    rank       Start planners and targets processes of this rank only; 0 leads, 1 is the first standby.
+    rank       Start planners and targets processes of this rank only; 0 is the leader, 1 the first standby.
     run_id     Take part in this run; by default a new one, or the one in the namespace.
     take_over  Take over from the launcher that runs this part here, as for an upgrade.
     """

@@ -15,7 +15,9 @@ from typing import Any
 import msgspec
 
 from launch_scripts.deploy.hosts import HostConfig, HostName, HostsConfig
+from launch_scripts.deploy.machines_needed import one_process, swarm_of
 from launch_scripts.process_table import (
+    LAUNCHER,
     RECORDED_BESIDE,
     ROLES,
     TABLE,
@@ -28,12 +30,6 @@ from swarm.config.scenario import Scenario, StandbyConfig
 from swarm.errors import ConfigError
 from swarm.liveness import job_of
 
-LAUNCHER_CORES = 0.06
-"""Cores that a machine's launcher takes in a swarm of 1,000 vehicles, by `./launch_scripts/bench swarm`."""
-_CORES = {"router": 0.11, "keeper": 0.04, "monitor": 0.17, "targets": 0.09}
-"""Cores that a process takes in a swarm of 1,000 vehicles and 10 targets, by `./launch_scripts/bench swarm`."""
-_CORES_PER_VEHICLE = 0.00066
-"""Cores of an agent; from the same table."""
 ROUTER, KEEPER, AGENT = "router", "keeper", "agent"
 
 
@@ -135,7 +131,8 @@ def make_plan(
     more = {role: max(getattr(scenario.standbys, role), hosts.losses) for role in ("planner", "targets")}
     scenario = msgspec.structs.replace(scenario, standbys=StandbyConfig(**more))
     _check(scenario, hosts)
-    placed = place(_processes(scenario, hosts), hosts.hosts, keepers)
+    cores = cores_of(scenario)
+    placed = place(_processes(scenario, hosts, cores), hosts.hosts, keepers, cores[LAUNCHER])
     routers = [host for host in hosts.hosts if ROUTER in host.roles]
     planned = tuple(_host(hosts.port, host, placed[host.name], routers) for host in hosts.hosts)
     # Routers admit what the scenario does not name itself, too: all keepers, routers and launchers.
@@ -170,7 +167,14 @@ def _check(scenario: Scenario, hosts: HostsConfig) -> None:
             )
 
 
-def _processes(scenario: Scenario, hosts: HostsConfig) -> list[PlannedProcess]:
+def cores_of(scenario: Scenario) -> dict[str, float]:
+    """Role -> cores that one process of it is expected to use; rounded, so that all machines make one plan."""
+    taken_ms = one_process(swarm_of(scenario))["cpu_ms_per_s"]
+    cores = {role: round(ms / 1000, 4) for role, ms in taken_ms.items()}
+    return {**cores, "places": cores["planner"]}  # it grows such trees, too; no measured swarm has one
+
+
+def _processes(scenario: Scenario, hosts: HostsConfig, cores: Mapping[str, float]) -> list[PlannedProcess]:
     """Every process: of a router one for each machine that may have one, in the order of the machines."""
     vehicles = {plan.id: plan.count for plan in plan_agents(scenario)}
     carried = {role for host in hosts.hosts for role in host.roles}
@@ -180,21 +184,24 @@ def _processes(scenario: Scenario, hosts: HostsConfig) -> list[PlannedProcess]:
     }
     named = [(role, str(n)) for role, numbers in ids.items() for n in numbers]
     named += [(spec.role, spec.id) for spec in processes_of(scenario, tuple(carried - ids.keys()))]
-    cores = {**_CORES, "planner": scenario.planner.cpu_budget, "places": scenario.planner.cpu_budget}
+    of_mean = len(vehicles) / max(sum(vehicles.values()), 1)
     return [
         PlannedProcess(
             role=role,
             id=id,
             certificate=certificate_name(scenario, role, id),
             job=KEEPER if role == KEEPER else f"{role}.{job_of(id)}",
-            cores=vehicles[id] * _CORES_PER_VEHICLE if role == AGENT else cores[role],
+            cores=cores[role] * (vehicles[id] * of_mean if role == AGENT else 1),
         )
         for role, id in named
     ]
 
 
 def place(
-    processes: Sequence[PlannedProcess], hosts: Sequence[HostConfig], before: Mapping[str, str]
+    processes: Sequence[PlannedProcess],
+    hosts: Sequence[HostConfig],
+    before: Mapping[str, str],
+    launcher_cores: float,
 ) -> dict[str, list[PlannedProcess]]:
     """Host name -> its processes. Every role has machines enough.
 
@@ -202,13 +209,14 @@ def place(
     or of all where there is one. Roles that few machines can carry are placed first, so that others leave them
     room; then agents, so that the loss of a machine costs no more vehicles than its share.
 
-    before  id of a keeper -> name of the machine that has its store
+    before          id of a keeper -> name of the machine that has its store
+    launcher_cores  that the launcher of each machine takes
     """
     placed: dict[str, list[PlannedProcess]] = {host.name: [] for host in hosts}
     carrying = {role: [host for host in hosts if role in host.roles] for role in ROLES}
 
     def load(host: HostConfig) -> float:
-        return LAUNCHER_CORES + sum(each.cores for each in placed[host.name])
+        return launcher_cores + sum(each.cores for each in placed[host.name])
 
     def put_apart(process: PlannedProcess) -> None:
         free = [h for h in carrying[process.role] if all(each.job != process.job for each in placed[h.name])]

@@ -1,4 +1,7 @@
-"""Number of machines that a swarm needs, from a table of measured swarms (`measured_runs.toml`). Pure.
+"""Cores, memory and traffic of a swarm, and how many machines it needs, from a table of measured swarms
+(`measured_runs.toml`). Pure.
+
+This is the only estimate of what processes take: `swarm check`, plans of machines and launchers ask it, too.
 
 Each figure of one process, such as the CPU of a planner, is interpolated between the measured runs: linear radial
 functions over the logarithms of vehicles, targets, agents, side of the map and tick rate (scipy's RBFInterpolator).
@@ -20,9 +23,10 @@ from pathlib import Path
 
 import msgspec
 import numpy as np
-from scipy.interpolate import RBFInterpolator
 
 from launch_scripts.process_table import LAUNCHER
+from swarm.config.agent_plan import plan_agents
+from swarm.config.scenario import Scenario
 from swarm.errors import ConfigError
 
 USED_SHARE = 0.6
@@ -35,7 +39,9 @@ OVERHEAD_BYTES = 100
 MOST_MACHINES = 2000
 MOST_SESSIONS = 8192
 """`transport/unicast/max_sessions` of a router (swarm/bus/zenoh_config.py)."""
-CELLS_PER_VEHICLE = 262.144
+LEAST_SIDE = 32
+"""Cells of a side: one tile of marks (`TILE_CELLS`)."""
+_CELLS_PER_VEHICLE = 262.144
 """Same density as in the scenario `thousand`: 512 x 512 cells for 1,000 vehicles."""
 
 _SINGLE = ("targets", "keeper", "monitor")
@@ -114,8 +120,25 @@ def reaches(swarm: Swarm) -> bool:
     return all(getattr(swarm, side) <= max(getattr(run, side) for run in measured_runs()) for side in sides)
 
 
+def side_of(vehicles: int, cells: int | None) -> int:
+    """Returns the side of a square map of `cells` cells; None: of the density of the measured ones."""
+    if cells is not None:
+        return math.isqrt(cells - 1) + 1
+    return max(round(math.sqrt(_CELLS_PER_VEHICLE * vehicles)), LEAST_SIDE)
+
+
+def swarm_of(scenario: Scenario, cells: int | None = None) -> Swarm:
+    """Returns the size of a scenario's swarm, on a terrain of `cells` cells if that is known."""
+    vehicles = max(scenario.vehicle_count, 1)
+    targets, agents = max(len(scenario.target_ids), 1), max(len(plan_agents(scenario)), 1)
+    side, tick_hz = side_of(vehicles, cells), scenario.vehicles.tick_hz
+    return Swarm(vehicles=vehicles, targets=targets, agents=agents, side=side, tick_hz=tick_hz)
+
+
 def one_process(swarm: Swarm) -> dict[str, dict[str, float]]:
     """Figure -> role -> what one process takes in a swarm of this size."""
+    from scipy.interpolate import RBFInterpolator  # a launcher imports this module, and seldom asks
+
     runs = measured_runs()
     columns = [(figure, role) for figure in _FIGURES for role in getattr(runs[0], figure)]
     taken = [[getattr(run, figure)[role] / _count(run, role) for figure, role in columns] for run in runs]

@@ -46,27 +46,16 @@ class ExitReason:
     refused: bool = False
 
 
-@dataclass(frozen=True, slots=True)
-class Reports:
-    """Channels from a process to its launcher.
+def run_child(
+    entry: str, setup: RoleSetup, log_path: Path, log_format: LogFormat, board: Any, pipe: Connection
+) -> None:
+    """Runs a role until it receives a stop signal. Ends the process with the role's exit code.
 
-    log_path     its log
-    log_format   of the log
-    health       memory of a `Board`, which the launcher reads
-    exit_reason  its last word, an `ExitReason`
+    board  memory of a `Board`, which the launcher reads
+    pipe   takes its last word, an `ExitReason`
     """
-
-    log_path: Path
-    log_format: LogFormat
-    health: Any
-    exit_reason: Connection
-
-
-def run_child(entry: str, setup: RoleSetup, reports: Reports) -> None:
-    """Runs a role until it receives a stop signal. Ends the process with the role's exit code."""
-    _redirect(reports.log_path, reports.log_format, setup)
-    setup = replace(setup, health=Health(Board(reports.health)))
-    pipe = reports.exit_reason
+    _redirect(log_path, log_format, setup)
+    setup = replace(setup, health=Health(Board(board)))
     # The launcher alone decides when to stop: it blocks SIGINT for all its processes, and SIGTERM until here.
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM})
     end_with_parent(signal.SIGCONT)  # the forkserver ends with the launcher: one that is stopped then sees it, too

@@ -16,7 +16,7 @@ from multiprocessing.context import ForkServerProcess
 from pathlib import Path
 from typing import Any
 
-from launch_scripts.launcher.child_main import ExitReason, Reports, run_child
+from launch_scripts.launcher.child_main import ExitReason, run_child
 from launch_scripts.launcher.forkserver import without_main
 from launch_scripts.launcher.hang_watch import LOOK_EVERY_S, STILL_S, IdleTime, Stillness, sight_of
 from launch_scripts.launcher.log_file import LogFormat
@@ -318,13 +318,13 @@ class LocalSwarm:
         if running.health is None:
             running.health = self._context.RawArray(ctypes.c_char, BOARD_BYTES)
         running.health[:] = bytes(BOARD_BYTES)  # of the generation before
-        reports = Reports(self._log_dir / f"{spec.name}.log", self._log_format, running.health, tell)
         first = not restarts
         setup = replace(
             setup, restarts=restarts, anew=setup.anew and first, takes_over=running.takes_over and first
         )
         # Daemons: should the launcher itself fail, multiprocessing ends them.
-        arguments = (spec.entry or TABLE[spec.role].entry, setup, reports)
+        entry, log_path = spec.entry or TABLE[spec.role].entry, self._log_dir / f"{spec.name}.log"
+        arguments = (entry, setup, log_path, self._log_format, running.health, tell)
         process = self._context.Process(target=run_child, args=arguments, name=spec.name, daemon=True)
         with without_main():
             process.start()

@@ -6,7 +6,6 @@ with the same versions.
 
 from __future__ import annotations
 
-import contextlib
 import random
 from collections.abc import Callable
 from functools import partial
@@ -35,13 +34,11 @@ class EventLog:
         4.000000000 crash planner-t3
 
     Seconds since the start, source, destination, topic, digest of the payload. Two runs are equal if their logs
-    are. Counts deliveries, and writes them if there is a file. A full disk cuts the log, not the simulation."""
+    are. Counts deliveries, and writes them if there is a file."""
 
     def __init__(self, out: TextIO | None) -> None:
         self.deliveries = 0
         self._out = out
-        self.cut: str | None = None
-        """Reason why the log has no end; None if it is whole."""
 
     def delivery(self, now_ns: int, source: str, destination: str, topic: str, payload: bytes) -> None:
         self.deliveries += 1
@@ -50,25 +47,9 @@ class EventLog:
             self.event(now_ns, f"{source} >", f"{destination} {topic} {digest}")
 
     def event(self, now_ns: int, what: str, whom: str) -> None:
-        whole, rest = divmod(now_ns - EPOCH_NS, NS_PER_S)
-        self._write(f"{whole}.{rest:09d} {what} {whom}\n")
-
-    def flush(self) -> None:
-        """Writes what waits."""
-        self._write("")
-
-    def _write(self, line: str) -> None:
-        if self._out is None:
-            return
-        try:
-            self._out.write(line)
-            if not line:
-                self._out.flush()
-        except OSError as error:
-            out, self._out = self._out, None
-            self.cut = error.strerror or str(error)
-            with contextlib.suppress(OSError):  # with what it could not write
-                out.close()
+        if self._out is not None:
+            whole, rest = divmod(now_ns - EPOCH_NS, NS_PER_S)
+            self._out.write(f"{whole}.{rest:09d} {what} {whom}\n")
 
 
 BOOT_SPREAD_S = 0.3
@@ -230,5 +211,4 @@ def run_to_end(
             progress("simulating", step / _STEPS_PER_S / seconds)
         simulation.run_until(seconds)
         simulation.finish()
-    simulation.log.flush()
     return simulation.report(seconds)

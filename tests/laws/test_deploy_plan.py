@@ -11,9 +11,9 @@ from hypothesis import strategies as st
 from support.effort import few
 
 from launch_scripts.deploy.hosts import HOST_ROLES, HostConfig, HostsConfig
-from launch_scripts.deploy.machine_plan import LAUNCHER_CORES, Plan, make_plan
+from launch_scripts.deploy.machine_plan import Plan, cores_of, make_plan
 from launch_scripts.launcher.run_options import UpOptions, chosen_processes
-from launch_scripts.process_table import processes_of
+from launch_scripts.process_table import LAUNCHER, processes_of
 from swarm.bus.zenoh_config import access_control
 from swarm.config.agent_plan import plan_agents
 from swarm.config.scenario import GroupConfig, PlannerConfig, Scenario, StandbyConfig, TargetConfig, VehicleConfig
@@ -114,7 +114,8 @@ def test_machines_have_agents_by_their_cores(plan: Plan) -> None:
     """A machine that has agents is as full of router, launcher and agents as the others, to one agent."""
     largest = max(process.cores for _, process in plan.processes if process.role == "agent")
     full = {
-        host.name: LAUNCHER_CORES + sum(process.cores for process in host.of("router") + host.of("agent"))
+        host.name: cores_of(plan.scenario)[LAUNCHER]
+        + sum(process.cores for process in host.of("router") + host.of("agent"))
         for host in plan.hosts
     }
     for host in plan.hosts:

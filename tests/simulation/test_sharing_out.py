@@ -25,7 +25,6 @@ def run(scenario: Scenario, seconds: float = 6.0) -> tuple[Counter[str | None], 
     log = io.StringIO()
     simulation = Simulation(scenario, trace=log)
     simulation.run_until(seconds)
-    simulation.log.flush()
     assert len(agents(simulation)) == 2
     return Counter(each.target for each in vehicles(simulation).values()), log.getvalue()
 

@@ -133,7 +133,7 @@ def test_a_mistake_is_answered_with_what_to_do(
     # Neither who else listens here nor how large this machine is has a part in it.
     if mistake.get("given") != "port_taken":
         monkeypatch.setattr(ports, "_taken", lambda host, port: False)
-    monkeypatch.setattr(machine, "this_machine", lambda runs: machine.Machine(64, 1 << 40, 1 << 50))
+    monkeypatch.setattr(machine, "this_machine", lambda runs: machine.Resources(64, 1 << 40, 1 << 50))
     if "toml" in mistake:
         text = mistake["toml"].replace("\\n", "\n")
         for name, begin in (("TINY", TINY), ("LAKE", LAKE), ("RING", RING)):

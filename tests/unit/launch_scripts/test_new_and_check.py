@@ -30,7 +30,7 @@ from swarm.errors import ConfigError
 from swarm.grid import GridSpec
 from vehicle_agent.start_cells import spawn_cells
 
-ROOMY = machine.Machine(64, 1 << 40, 1 << 50)
+ROOMY = machine.Resources(64, 1 << 40, 1 << 50)
 
 
 @pytest.fixture(autouse=True)
@@ -138,7 +138,7 @@ def test_a_commented_scenario_is_read_as_what_was_written(
 def test_check_says_all_at_once_in_the_order_of_weight(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, swarm: Swarm
 ) -> None:
-    monkeypatch.setattr(machine, "this_machine", lambda runs: machine.Machine(1, 1 << 20, 1 << 10))
+    monkeypatch.setattr(machine, "this_machine", lambda runs: machine.Resources(1, 1 << 20, 1 << 10))
     (tmp_path / "s.toml").write_text(
         '[terrain]\nsource = "synthetic"\nrows = 24\ncols = 24\nrelief_m = 1\n'
         "[[targets]]\nname = 'a'\nstart = [99, 1]\n[[targets]]\nname = 'b'\nstart = [1, 99]\n"
@@ -275,11 +275,11 @@ def test_ground_that_can_be_entered_and_not_left_is_what_steps_lead_to_and_not_b
 def test_a_machine_that_is_too_small_is_a_warning_with_what_to_do() -> None:
     scenario = parse_scenario("[[groups]]\nvehicles = 1200\n[[targets]]\ncount = 10\n[vehicles]\ntick_hz = 5")
     wanted = machine.needs_of(scenario, 512**2)
-    (found,) = machine.against(scenario, wanted, machine.Machine(2, 1 << 40, 1 << 50), Path())
+    (found,) = machine.against(scenario, wanted, machine.Resources(2, 1 << 40, 1 << 50), Path())
     assert found.level == "warning"
-    assert "1,200 vehicles of 48 agents and 10 targets at 5 Hz keep about 1.7 cores busy, and there" in found.text
+    assert "1,200 vehicles of 48 agents and 10 targets at 5 Hz keep about 4.9 cores busy, and there" in found.text
     assert "there are 2: ticks will be late; a larger vehicles.per_agent, fewer of them, a lower" in found.text
-    assert list(machine.against(scenario, wanted, machine.Machine(4, 1 << 40, 1 << 50), Path())) == []
+    assert list(machine.against(scenario, wanted, machine.Resources(8, 1 << 40, 1 << 50), Path())) == []
 
 
 def test_the_memory_of_routes_to_places_is_the_budget_of_trees_and_a_tree_in_hand_of_each_class() -> None:

@@ -4,7 +4,7 @@ from typing import Any
 
 import pytest
 
-from launch_scripts.check.machine_check import Machine, why_no_room
+from launch_scripts.check.machine_check import Resources, why_no_room
 from launch_scripts.launcher.local_processes import Running
 from launch_scripts.launcher.ordered_planners import LEAVES_TO_OTHERS_S, OrderedPlanners, with_target
 from launch_scripts.process_table import ProcessSpec, processes_of
@@ -16,7 +16,7 @@ from swarm.wire.messages.orders import Order
 SCENARIO = parse_scenario('[[targets]]\nname = "t"\ncount = 2\n[standbys]\nplanner = 1')
 
 
-LARGE = Machine(64, 1 << 40, 0)
+LARGE = Resources(64, 1 << 40, 0)
 
 
 class Swarm:
@@ -42,7 +42,7 @@ class Swarm:
 
 
 def planners(
-    swarm: Swarm, *, whole: bool = True, ranks: tuple[int, ...] = (0, 1), here: Machine = LARGE
+    swarm: Swarm, *, whole: bool = True, ranks: tuple[int, ...] = (0, 1), here: Resources = LARGE
 ) -> tuple[OrderedPlanners, list[str]]:
     said: list[str] = []
     stands_for: Any = swarm
@@ -126,9 +126,9 @@ def test_the_process_of_an_added_target_is_told_of_it() -> None:
 
 
 @pytest.mark.parametrize(
-    ("here", "says"), [(Machine(2, 1 << 40, 0), "2 cores"), (Machine(64, 1 << 20, 0), "memory")]
+    ("here", "says"), [(Resources(2, 1 << 40, 0), "2 cores"), (Resources(64, 1 << 20, 0), "memory")]
 )
-def test_no_more_planners_start_than_the_machine_carries_and_few_at_once(here: Machine, says: str) -> None:
+def test_no_more_planners_start_than_the_machine_carries_and_few_at_once(here: Resources, says: str) -> None:
     swarm = Swarm()
     ordered, said = planners(swarm, here=here)
     orders = book(*((f"x{n}", 1, False) for n in range(200)))
