@@ -61,8 +61,12 @@ def test_ports_of_the_live_view_matter_only_if_it_is_served_here() -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         scenario = Scenario(monitor=MonitorConfig(web_port=port))
-        with pytest.raises(BusError, match=rf"port {port}, which the live view \(monitor.web_port\) needs"):
+        with pytest.raises(
+            BusError, match=rf"port {port} of the live view \(monitor.web_port\) is taken.* --port N"
+        ):
             ports.check_ports(scenario, ("monitor",))
+        with pytest.raises(BusError, match=rf"port {port} of the metrics .*another with --metrics-port N; 0 picks"):
+            ports.check_ports(scenario, (), ("127.0.0.1", port))
         ports.check_ports(scenario, ("agent",))
 
 
