@@ -114,7 +114,7 @@ def test_an_answer_names_its_places_so_that_they_can_be_given_again(capsys: pyte
     first, second, *_ = capsys.readouterr().out.splitlines()
     assert first.startswith("from cell:10,10 (xy:500210,5199790, latlon:46.9")
     assert second.startswith("to t3 at cell:8,13 (xy:500270,5199830, latlon:46.9")
-    assert "30.0 s, proven within 3.45 % of the best" in second
+    assert "30.0 s, proven to be at most 3.45% above the optimum" in second
     for line, cell in ((first, START), (second, GRID.cell(8, 13))):
         assert cell_of(line.partition("latlon:")[2].partition(")")[0], FRAME, "--from") == cell
     show(answer(RouteStatus.LETHAL_START))
