@@ -11,6 +11,8 @@ from swarm.bus.endpoints import host_port
 from swarm.config.scenario import Scenario
 from swarm.errors import BusError, ConfigError
 
+_METRICS = "the metrics (--metrics-port)"
+
 
 def free_ports(count: int) -> list[int]:
     """Ports of 127.0.0.1 which are free now."""
@@ -36,16 +38,14 @@ def check_ports(scenario: Scenario, roles: tuple[str, ...], metrics: tuple[str, 
     wanted = [("the router (network.listen)", *host_port(endpoint)) for endpoint in listen]
     if "monitor" in roles and scenario.monitor.live:
         wanted.append(("the live view (monitor.web_port)", "127.0.0.1", scenario.monitor.web_port))
-    wanted.append(("the metrics (--metrics-port)", *metrics))
+    wanted.append((_METRICS, *metrics))
     for (who, host, port), (other, its_host, its_port) in combinations(wanted, 2):
         if port and port == its_port and _overlap(host, its_host):
             raise ConfigError(f"port {port} is that of {who} and of {other}; expected another for one of them")
     for who, host, port in wanted:
         if port and _taken(host, port):
-            raise BusError(
-                f"port {port}, which {who} needs, is taken; choose others with --port N (N and N+1 are used), "
-                "or let --port 0 pick free ones"
-            )
+            other = "--metrics-port N" if who == _METRICS else "--port N (N and N+1 are used)"
+            raise BusError(f"port {port} of {who} is taken; choose another with {other}; 0 picks a free one")
 
 
 def _overlap(*hosts: str) -> bool:

@@ -143,8 +143,9 @@ class RouteFinder:
             self._goals.changed(self._goals.costs.apply(self._pace, [window]))
         self._update([window])
 
-    def route(self, row: int, col: int) -> FoundRoute:
-        """The cheapest route that is known from a cell, with its proven lower bound. Outside is a status."""
+    def route(self, row: int, col: int | None = None) -> FoundRoute:
+        """The cheapest route that is known from a cell, with its proven lower bound. Outside is a status. Raises
+        TypeError unless both are whole numbers."""
         row, col = _whole(row, col)
         cell = self.grid.cell(row, col) if self.grid.inside(row, col) else -1
         found: Route = self._tree.routes([cell])[0]
@@ -235,4 +236,4 @@ def _whole(row: Any, col: Any) -> tuple[int, int]:
     try:
         return operator.index(row), operator.index(col)
     except TypeError as error:
-        raise TypeError(f"row {row!r}, col {col!r}: a cell has whole numbers") from error
+        raise TypeError(f"row {row!r}, col {col!r}: a cell is two whole numbers, such as route(1, 1)") from error

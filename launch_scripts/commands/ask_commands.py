@@ -68,7 +68,9 @@ def route(
     check_target(out, "--out", *FORMATS, *MISSIONS, ".png", force=force)
     if terrain is not None:
         if start is None or end is None or target is not None:
-            raise ConfigError("--terrain finds a route without a swarm: give --from and --to, and no --target")
+            lacks = [f"{name} is missing" for name, at in (("--from", start), ("--to", end)) if at is None]
+            found = ", ".join(lacks) or "--target asks a swarm"
+            raise ConfigError(f"{found}: --terrain finds a route without a swarm; give --from and --to")
         scenario = find_scenario(terrain, preset, crs)
         terrain_routes.print_route(terrain_routes.find_route(scenario, start, end), out, as_json)
         return
@@ -91,6 +93,8 @@ def route(
         typer.echo(swarm_route.as_json(answer))
     else:
         swarm_route.show(answer)
+        if out is not None:
+            typer.echo(f"route: {out}")
 
 
 @command(app, ASK)

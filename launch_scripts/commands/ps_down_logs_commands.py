@@ -250,10 +250,12 @@ def _chosen(name: str | None, only: bool = False) -> KnownRun:
     if name is None:
         if not (known := registered()):
             raise ConfigError("no run of yours is registered on this machine; `swarm up SCENARIO` starts one")
-        running = [each.name for each in known if each.launchers]
+        running = [each for each in known if each.launchers]
         if only and len(running) > 1:
-            raise ConfigError(f"found {len(running)} runs here, expected the name of one: {', '.join(running)}")
-        say_newest(known[0].name, running[1:])
+            names = [each.name for each in known]  # one may be that of several folders, as of two parts of a run
+            told = ", ".join(r.name if names.count(r.name) == 1 else str(r.folder) for r in running)
+            raise ConfigError(f"found {len(running)} runs here, expected the name or folder of one: {told}")
+        say_newest(known[0].name, [each.name for each in running[1:]])
         return known[0]
     return _run_in(find_run(name, RUNS).resolve())
 

@@ -98,9 +98,8 @@ def ask_planner(bus: Bus, where: object, target: str, start: Place, vehicle_clas
     row, col = frame.grid.row_col(cell)
     request = RouteRequest(row=row, col=col, vehicle_class=vehicle_class)
     began_s = time.monotonic()
-    reply = _reply(
-        bus, ROUTE, request, RouteReply, f"no planner of target {target!r} answers {where}", target=target
-    )
+    missing = f"no planner of target {target!r} answers {where}; `swarm status` lists the targets"
+    reply = _reply(bus, ROUTE, request, RouteReply, missing, target=target)
     return Answer(reply, frame, cell, (time.monotonic() - began_s) * 1e3)
 
 
@@ -203,7 +202,9 @@ def show(answer: Answer) -> None:
         }[found.status]
         typer.echo(f"{found.status.value}: {meaning}")
         return
-    gap = f"proven within {100 * (found.gap - 1):.2f} % of the best" if math.isfinite(found.gap) else "gap unknown"
+    gap = (
+        f"proven to be at most {found.gap - 1:.2%} above the optimum" if math.isfinite(found.gap) else "gap unknown"
+    )
     typer.echo(f"from {written(answer.frame, answer.start)}")
     if found.status is RouteStatus.SEARCHING:
         goal = answer.goal

@@ -118,7 +118,7 @@ def layers_of(route: DescribedRoute, ending: str) -> list[Layer]:
     if route.height_m is not None and np.isfinite(route.height_m).all():
         xy_m = np.column_stack([xy_m, route.height_m.round(2)])
     kinds: dict[type, FieldKind] = {str: "text", int: "int", float: "real", dict: "json", list: "json"}
-    values = {"name": route.name, **route.facts()}
+    values = {"name": route.name, **route.facts(), "rule": route.rule, "resolution_m": route.grid.resolution_m}
     if ending == ".geojson":
         values |= {name: each.tolist() for name, each in steps.items()}
     # A line has two points at least, even for a vehicle that is already there.
@@ -223,6 +223,8 @@ def print_route(found: DescribedRoute, out: Path | None, as_json: bool) -> None:
     typer.echo(
         f"proven to be at most {above:.2%} above the optimum\n{found.rule}, cells of {found.grid.resolution_m:g} m"
     )
+    if out is not None:
+        typer.echo(f"route: {out}")
 
 
 def between(scenario: Scenario, start: str, end: str) -> tuple[Terrain, int, int]:
@@ -256,6 +258,7 @@ def _check_open(scenario: Scenario, terrain: Terrain, cell: int, option: str, ot
     seconds = terrain.pace_s_per_m if lethal[other] else finder_for(scenario, terrain, other).cost_to_go_s()
     (row, col), (rows, cols) = grid.row_col(cell), np.nonzero(np.isfinite(seconds))
     told = f"{option} is on lethal ground, {written(frame, cell)}, class {kind}: no way leads there"
+    told += f"; ground above {scenario.cost.max_slope_deg:g} degrees is lethal (--preset, cost.max_slope_deg)"
     if len(rows):
         near = int(np.argmin((rows - row) ** 2 + (cols - col) ** 2))
         told += (

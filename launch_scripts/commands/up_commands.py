@@ -78,7 +78,8 @@ class SomeProcesses:
 
     only       Start only this role or process: planner, planner.t0.r1; may be given several times.
     rank       Start planners and targets processes of this rank only; 0 is the leader, 1 the first standby.
-    run_id     Take part in this run; by default a new one, or the one in the namespace.
+    run_id     Take part in this run. By default a new one; of some processes, that of --connect, else one named
+               after the scenario, which later starts continue.
     take_over  Take over from the launcher that runs this part here, as for an upgrade.
     """
 

@@ -71,11 +71,14 @@ def scenario_path(name: str) -> Path:
     names = sorted(file.stem for file in SCENARIOS.glob("*.toml"))
     if path.suffix == ".toml":
         raise ConfigError(
-            f"cannot read scenario {name}: No such file; `swarm new {name}` writes one, built in are"
+            f"cannot read scenario {path.absolute()}: No such file; `swarm new {name}` writes one, built in are"
             f" {', '.join(names)}"
         )
     if path.suffix in FILE_KINDS.split(", "):
-        raise ConfigError(f"no terrain {name!r}: no such file")
+        files = [each.name for each in path.parent.glob("*")]
+        raise ConfigError(
+            f"no terrain {name!r}: no such file in {path.parent.absolute()}{nearest(path.name, files)}"
+        )
     raise ConfigError(
         f"no scenario {quoted(name)}{nearest(name, names)}; give a .toml file or one of: {', '.join(names)}"
     )

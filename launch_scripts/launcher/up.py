@@ -34,7 +34,7 @@ from launch_scripts.launcher.terminal_tables import live_table, plain_line
 from launch_scripts.launcher.watcher import OwnPart, Watcher, check_vacant
 from launch_scripts.observe import fact_table as facts
 from launch_scripts.observe.latest_messages import plan_of_members
-from launch_scripts.observe.run_folder import DiskWatch, begin_run
+from launch_scripts.observe.run_folder import REPORT_FILE, DiskWatch, begin_run
 from launch_scripts.observe.run_observer import ask_run
 from launch_scripts.observe.run_recorder import Recorder
 from launch_scripts.observe.run_registry import LAUNCHER_LOG, register
@@ -184,6 +184,8 @@ class _Run:
         records = self._options.records
         for sentence in begin_run(self._run_dir, self._options.scenario, self._run_id, recorded=records):
             self._terminal.say(sentence, "yellow")
+        if self._options.run_id is None and not self._options.takes_over and (self._run_dir / REPORT_FILE).exists():
+            self._terminal.say(f"run {self._run_id} continues: there is a report of it already", "yellow")
         log.info("terrain is ready")
         self._wait(lambda: self._warm_up.progress, self._warm_up.done)
         if self._stop_asked:
@@ -433,6 +435,7 @@ class _Run:
         self._terminal.close()
         asked = "; once more, and what still runs is killed" if self._stop_asked else ""
         self._terminal.say(f"stopping{asked}")
+        watcher.end([running.spec for running in self._swarm.running])
         with self._terminal.busy(self._stopping):
             failures = self._swarm.stop(lambda: watcher.listen(_TURN_S), force=self._stop_asked.force)
             watcher.finish()

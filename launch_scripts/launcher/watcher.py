@@ -88,6 +88,8 @@ class Watcher(RunObserver):
         """Connections to it, as its monitor last said."""
         self.routes_served = False
         self._clock = clock
+        self._ends: frozenset[tuple[str, str]] = frozenset()
+        """(role, id) of the launcher's own processes, once it ends them."""
         self._inbox = Inbox()
         # The first route tells that routes are served, sooner than any figures do.
         hears = _OF_PART if isinstance(known, OwnPart) else {**RECORDED, FOLLOWED: 0.0}
@@ -109,6 +111,11 @@ class Watcher(RunObserver):
         for spec in own - self.known.own:
             self.keep_samples_of(spec.role, spec.id)
         self.known.look_after(own)
+
+    def end(self, own: Collection[ProcessSpec]) -> None:
+        """The launcher ends its own processes: from now on, no other process counts as gone. Where this launcher's
+        router was theirs, they only lose the link."""
+        self._ends = frozenset((spec.role, spec.id) for spec in own)
 
     def listen(self, for_s: float) -> None:
         """Takes in what arrives within some seconds, all of it at their end: the launcher wakes seldom."""
@@ -144,6 +151,8 @@ class Watcher(RunObserver):
             case Heard(message=Stats(role="monitor", web_port=port, gauges=gauges)):
                 self.web_port = port or self.web_port
                 self.viewers = gauges.get(VIEWERS, 0.0)
+            case Disappeared(peer) if self._ends and (peer.role, peer.id) not in self._ends:
+                return
             case Disappeared(Peer(role="monitor")):
                 self.viewers = 0.0
             case Heard(message=Followed()):

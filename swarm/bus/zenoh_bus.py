@@ -9,6 +9,8 @@ wakes ten times a second for nothing (`Arrivals`)."""
 
 from __future__ import annotations
 
+import atexit
+import contextlib
 import logging
 import threading
 import time
@@ -191,7 +193,7 @@ def _why_not(error: zenoh.ZError, network: NetworkConfig, mode: str) -> BusError
 
 
 class ZenohBus:
-    """A `Bus` on one Zenoh session. Always `close` it: an open session can hang the interpreter's exit.
+    """A `Bus` on one Zenoh session, which `close` or the interpreter's exit closes.
 
     Its methods are called by the thread that owns the service. The threads that read channels change the counters
     and the log only; each ends when what it reads is undeclared. An unexpected error in one, or in a callback of
@@ -217,6 +219,7 @@ class ZenohBus:
         """One per channel; those that have ended are removed when the next is ended."""
         self._closing = threading.Event()
         """Set by `close`, for good: nothing is sent from then on."""
+        atexit.register(self.close)
 
     @property
     def namespace(self) -> str:
@@ -457,12 +460,19 @@ class ZenohBus:
         self._read(listener, arrive, "links", arrivals.take)
 
     def close(self) -> None:
-        """Leaves the network, within `_CLOSE_S` even if the router hangs, for which Zenoh would wait ten
-        seconds."""
+        """Leaves the network, within `_CLOSE_S` even if the router hangs, for which Zenoh waits ten seconds.
+
+        The exit of the interpreter waits for the rest: a thread which returns from Zenoh after the interpreter has
+        ended aborts the process.
+        """
         if self.closed:
             return
         self._closing.set()
-        closer = threading.Thread(target=self._undeclare, name="close", daemon=True)
+        atexit.unregister(self.close)
+        if not threading.main_thread().is_alive():  # at the exit, where no thread can be started
+            self._undeclare()
+            return
+        closer = threading.Thread(target=self._undeclare, name="close", daemon=False)
         closer.start()
         closer.join(_CLOSE_S)
         if closer.is_alive():
@@ -479,7 +489,8 @@ class ZenohBus:
             entity.undeclare()
         for thread in self._threads:
             thread.join(timeout=2.0)
-        self._session.close()  # type: ignore[no-untyped-call]
+        with contextlib.suppress(zenoh.ZError):  # the router hangs
+            self._session.close()  # type: ignore[no-untyped-call]
 
     def _read(self, entity: Any, arrive: Callable[[Any], None], name: str, take: Callable[[], Any]) -> None:
         """Makes what `take` returns arrive, one after the other on a thread of its own, until the entity is

@@ -384,7 +384,7 @@ def connect(
         return open_bus(network, authenticator=authenticator_of(network, session.run.run_id))
 
     swarm = Swarm(session, stop, open_trusted)
-    atexit.register(swarm.close)  # an open session of Zenoh aborts the interpreter at its exit
+    atexit.register(swarm.close)  # a program that ends takes its vehicles away
     return swarm
 
 

@@ -7,6 +7,8 @@ import os
 import re
 import signal
 import socket
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -290,21 +292,30 @@ def test_a_router_killed_and_started_again_is_found_by_everybody(world):
         assert heard[-1] == Heard(POSE, {"target": "t0"}, pose(seq=times))
 
 
-def test_closing_takes_seconds_at_most_though_the_router_hangs(world):
-    a, links = world.bus("a"), Box()
-    a.watch_links(links)
-    a.watch_alive(Box())
-    a.serve(RUN, Box(), role="agent", id="a")
-    world.settle()
-    os.kill(world.router.process.pid, signal.SIGSTOP)
-    try:
-        world.until(lambda: LinkChanged(False) in links)
-        world.until(lambda: len(asked(world, a, RUN, Nothing(), timeout_s=0.2).of(AskEnded)) == 1)
-        began_s = time.monotonic()
-        a.close()
-        assert time.monotonic() - began_s < 4.0
-    finally:
-        os.kill(world.router.process.pid, signal.SIGCONT)
+LEAVES_A_STALLED_ROUTER = """
+import os, signal, sys, time
+from swarm.bus.zenoh_bus import open_bus
+from swarm.config.scenario import NetworkConfig
+class SlowExit:
+    def __del__(self, sleep=time.sleep): sleep(12)  # in which Zenoh gives the router up
+slow, heard = SlowExit(), []
+bus = open_bus(NetworkConfig(connect=(sys.argv[1],)))
+bus.watch_links(heard.append)
+bus.watch_alive(heard.append)
+os.kill(int(sys.argv[2]), signal.SIGSTOP)
+while not heard: time.sleep(0.1)
+began_s = time.monotonic()
+bus.close()
+sys.exit(f"closed in {time.monotonic() - began_s:.0f} s")
+"""
+
+
+def test_closing_takes_seconds_at_most_though_the_router_hangs_and_does_not_abort_the_program_that_ends(world):
+    router = world.router.process.pid
+    words = [sys.executable, "-c", LEAVES_A_STALLED_ROUTER, world.router.endpoint, str(router)]
+    ended = subprocess.run(words, capture_output=True, text=True, timeout=90, check=False)
+    os.kill(router, signal.SIGCONT)
+    assert (ended.returncode, ended.stderr.splitlines()[-1]) in ((1, "closed in 3 s"), (1, "closed in 4 s"))
 
 
 def test_nobody_to_reach_is_a_sentence(world):

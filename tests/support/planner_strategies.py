@@ -14,14 +14,7 @@ from swarm.config.ground import CostConfig, SlopeRule
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec
 
-STRATEGIES = (
-    "full",
-    "exact",
-    "variable_range",
-    "multi_resolution",
-    "variable_range+multi_resolution",
-    "auto",
-)
+STRATEGIES = ("full", "exact", "variable_range", "multi_resolution", "variable_range+multi_resolution", "auto")
 
 RULES: tuple[dict[str, Any], ...] = (
     {"neighbours": 8, "edge": "octile", "corner_cutting": False},

@@ -16,14 +16,7 @@ from swarm.config.scenario import PlannerConfig
 from swarm.errors import TerrainError
 from swarm.wire.route_columns import Route, RouteBatch, RouteStatus
 
-STRATEGIES = (
-    "auto",
-    "exact",
-    "full",
-    "variable_range",
-    "multi_resolution",
-    "variable_range+multi_resolution",
-)
+STRATEGIES = ("auto", "exact", "full", "variable_range", "multi_resolution", "variable_range+multi_resolution")
 
 
 # --- peers -------------------------------------------------------------------------------------------------------

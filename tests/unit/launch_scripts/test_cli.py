@@ -61,8 +61,12 @@ def test_ports_of_the_live_view_matter_only_if_it_is_served_here() -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
         scenario = Scenario(monitor=MonitorConfig(web_port=port))
-        with pytest.raises(BusError, match=rf"port {port}, which the live view \(monitor.web_port\) needs"):
+        with pytest.raises(
+            BusError, match=rf"port {port} of the live view \(monitor.web_port\) is taken.* --port N"
+        ):
             ports.check_ports(scenario, ("monitor",))
+        with pytest.raises(BusError, match=rf"port {port} of the metrics .*another with --metrics-port N; 0 picks"):
+            ports.check_ports(scenario, (), ("127.0.0.1", port))
         ports.check_ports(scenario, ("agent",))
 
 
@@ -110,7 +114,7 @@ def test_an_answer_names_its_places_so_that_they_can_be_given_again(capsys: pyte
     first, second, *_ = capsys.readouterr().out.splitlines()
     assert first.startswith("from cell:10,10 (xy:500210,5199790, latlon:46.9")
     assert second.startswith("to t3 at cell:8,13 (xy:500270,5199830, latlon:46.9")
-    assert "30.0 s, proven within 3.45 % of the best" in second
+    assert "30.0 s, proven to be at most 3.45% above the optimum" in second
     for line, cell in ((first, START), (second, GRID.cell(8, 13))):
         assert cell_of(line.partition("latlon:")[2].partition(")")[0], FRAME, "--from") == cell
     show(answer(RouteStatus.LETHAL_START))

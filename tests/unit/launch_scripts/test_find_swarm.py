@@ -12,6 +12,7 @@ import msgspec
 import pytest
 from support.command import Swarm
 
+from launch_scripts.commands.ps_down_logs_commands import _chosen
 from launch_scripts.commands.shared_options import Where, find_swarm
 from launch_scripts.observe.run_folder import begin_run, find_run
 from launch_scripts.observe.run_registry import _started_s, register, registered
@@ -119,6 +120,8 @@ def test_a_run_is_found_by_its_name_from_any_folder_until_its_folder_goes(
         ConfigError, match=r"found 2 runs called 'first', expected the folder of one: /.*/third/first"
     ):
         find_run("first", Path("runs"))
+    with pytest.raises(ConfigError, match=r"expected the name or folder of one: second, /.*/first/first$"):
+        _chosen(None, only=True)
     (tmp_path / "third" / "first").rmdir()
     (tmp_path / "second").rename(tmp_path / "away")
     assert [run.name for run in registered()] == ["second", "first"], "the launcher of the second one runs"

@@ -17,7 +17,7 @@ from launch_scripts.launcher.watcher import OwnPart, Watcher
 from launch_scripts.observe.run_alarms import EVIDENCE, KINDS, alarms_of
 from launch_scripts.observe.run_recorder import Recorder
 from launch_scripts.process_table import ProcessSpec, processes_of
-from swarm.bus.bus import Disappeared
+from swarm.bus.bus import Appeared, Disappeared
 from swarm.clock import NS_PER_S
 from swarm.config.load import parse_scenario
 from swarm.liveness import Peer, split_rank
@@ -95,6 +95,15 @@ def test_where_the_live_view_is_is_learned_from_the_figures_of_the_monitor_alone
         assert watcher.web_port == watcher.viewers == (port if role == "monitor" else 0)
     watcher.take(Disappeared(Peer("monitor", "0", 1)), 0)
     assert not watcher.viewers, "a demo goes on for viewers that are there"
+
+
+def test_processes_of_others_are_not_gone_because_the_launcher_ends_its_own_and_their_router() -> None:
+    watcher, _ = begun(SwarmModel())
+    watcher.end([ProcessSpec("agent", "a0")])
+    for event in (Appeared, Disappeared):
+        for id in ("a0", "a1"):
+            watcher.take(event(Peer("agent", id, 1)), 0)
+    assert watcher.known.observed.up() == [("agent", "a1")]
 
 
 # --- a launcher that records nothing -----------------------------------------------------------------------------

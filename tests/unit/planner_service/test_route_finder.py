@@ -109,8 +109,10 @@ def test_a_block_may_end_at_the_border_of_the_grid(block: Any, row: int, col: in
 def test_a_place_between_cells_and_an_unknown_setting_are_refused() -> None:
     finder = RouteFinder(np.ones((6, 6)), (5, 5))
     for call in (finder.route, lambda *place: finder.move(place), lambda *place: finder.change([[1.0]], *place)):
-        with pytest.raises(TypeError, match=r"row 2\.9, col 1: a cell has whole numbers"):
+        with pytest.raises(TypeError, match=r"row 2\.9, col 1: a cell is two whole numbers"):
             call(2.9, 1)
+    with pytest.raises(TypeError, match=r"row \(1, 1\), col None: a cell is two whole numbers"):
+        finder.route((1, 1))  # type: ignore[arg-type]
     with pytest.raises(TypeError, match="strateg is no setting; did you mean 'strategy'"):
         RouteFinder(np.ones((6, 6)), (5, 5), strateg="full")
 

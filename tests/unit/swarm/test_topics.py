@@ -81,15 +81,7 @@ def test_the_key_of_one_value_needs_every_field_and_no_other():
 
 @pytest.mark.parametrize(
     "key",
-    [
-        "swarm",
-        "swarm/",
-        "other/known/a0",
-        "swarm/known/a0/x",
-        "swarm/known/",
-        "swarmknown/a0",
-        "swarm/marks/1/2",
-    ],
+    ["swarm", "swarm/", "other/known/a0", "swarm/known/a0/x", "swarm/known/", "swarmknown/a0", "swarm/marks/1/2"],
 )
 def test_a_key_of_something_else_has_no_fields(key):
     assert KNOWN.parse("swarm", key) is None
