@@ -307,7 +307,10 @@ def zone_mask(zone: ZoneConfig, grid: GridSpec, where: str = "zone") -> Bools:
     else:
         inside = polygon_mask(zone.polygon_m or (), grid)
         width, height = grid.cols * grid.resolution_m, grid.rows * grid.resolution_m
-        why = f"its corners are metres east and south of the north-west corner of {width:.0f} m x {height:.0f} m"
+        why = (
+            f"it lies outside the terrain of {width:.0f} m x {height:.0f} m; its corners are metres east and south"
+            " of the north-west corner"
+        )
     if not inside.any():
         raise TerrainError(f"{named} covers no cell of the terrain: {why}")
     return inside

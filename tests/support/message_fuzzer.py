@@ -214,7 +214,8 @@ class MessageFuzzer:
             for _ in range(choice((1, 3, 40)))
         }
         columns = columns_of(said, self._stamp_ns(0, (1 << 62) - 1))
-        return {name: each.tobytes() for name, each in columns._asdict().items()}
+        names = ("cells", "kinds", "paces", "stamps_ns")
+        return {name: each.tobytes() for name, each in zip(names, columns, strict=True)}
 
     def _legs(self, steps: int) -> bytes:
         """Segments over that many steps, or none."""
