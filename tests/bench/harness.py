@@ -32,6 +32,7 @@ from swarm.errors import ConfigError
 BENCHMARKS = {
     "peers": "bench.planning.peers",
     "moves": "bench.planning.moves",
+    "pursuit": "bench.planning.pursuit",
     "kernels": "bench.planning.kernels",
     "directed": "bench.planning.directed",
     "start": "bench.planning.cold_start",

@@ -56,8 +56,13 @@ class Machines:
 
     def lose(self, name: str) -> None:
         """Simulates the loss of power of the machine: first its cable is cut, so that its processes end unheard."""
-        _ip("-n", self.space("switch"), "link", "set", f"p{list(self.addresses).index(name)}", "down")
+        self.cable(name, up=False)
         self._kill(name)
+
+    def cable(self, name: str, up: bool) -> None:
+        """Plugs a machine's cable in, or pulls it out."""
+        port = f"p{list(self.addresses).index(name)}"
+        _ip("-n", self.space("switch"), "link", "set", port, "up" if up else "down")
 
     def _kill(self, name: str) -> None:
         """Kills whatever runs in a machine's namespace, by what the kernel says is in it."""

@@ -17,13 +17,13 @@ import msgspec
 import numpy as np
 import psutil
 from numpy.typing import NDArray
-from support.fields import Field
+from support.fields import Field, Pace
 from support.slow_twins import drive
 
 from bench.harness import cpu_ms, track
 from launch_scripts.simulation.world.walks import WALKS, Budget, Walker, WalkWorld
 from planner_service.strategy import ROWS, STAGES
-from planner_service.target_tree import TargetTree
+from planner_service.target_tree import TargetTree, Update
 from swarm.config.scenario import PlannerConfig
 from swarm.config.setting_types import Strategy, Walk
 from swarm.errors import ConfigError
@@ -260,6 +260,17 @@ class _Crowd:
         return self._exact
 
 
+def follow(tree: TargetTree, pace: Pace, cell: int) -> Update:
+    """Follows a move of the target. The tree learns how long it took, as in a planner."""
+    began_ns = time.thread_time_ns()
+    update = tree.update(pace, cell, [], 0)
+    if update.kind == "full":
+        tree.times.observe_full_ns(time.thread_time_ns() - began_ns)
+    elif update.kind == "exact":
+        tree.times.observe_exact_ns(time.thread_time_ns() - began_ns)
+    return update
+
+
 class _Racer:
     """The trees of one entrant, one per target."""
 
@@ -326,12 +337,7 @@ class _Racer:
     def _follow(self, n: int, cell: int, followed: Any = (), grow: bool = False, count: bool = True) -> None:
         """Follows a move of the target. A full growth, asked for or due by `grow`, is adopted at once."""
         tree = self._trees[n]
-        began_ns = time.thread_time_ns()
-        update = tree.update(self._field.pace, cell, [], 0)
-        if update.kind == "full":
-            tree.times.observe_full_ns(time.thread_time_ns() - began_ns)
-        elif update.kind == "exact":
-            tree.times.observe_exact_ns(time.thread_time_ns() - began_ns)
+        update = follow(tree, self._field.pace, cell)
         if tree.wants_strides:
             tree.take_strides(tree.stride_job()())
         if count:

@@ -1,7 +1,7 @@
 """The time until all replicas are equal after a partition heals: two routers in network namespaces, over mutual
 TLS.
 
-Two namespaces stand for two machines, a pair of veth for the cable between them. Each side runs a router, a keeper
+Two namespaces stand for two machines, on one bridge. Each side runs a router, a keeper
 with its store on disk, two authors and a listener, each as a process of its own. The authors mark eight cells every
 50 ms; the sides meet over tls/ with certificates made for the purpose. A round takes the cable down, lets both
 sides write, stops writing, puts the cable up, and measures until every replica of both sides tells the same digest
@@ -27,7 +27,7 @@ from typing import Annotated, Any
 
 import numpy as np
 import typer
-from support.machines import why_not
+from support.machines import Machines, machines, why_not
 
 from bench.harness import benchmark, track
 from launch_scripts.deploy.certificates import issue
@@ -158,8 +158,7 @@ def _obey(service: object, process: Process) -> None:
 
 
 def _say(words: list[object]) -> None:
-    sys.stdout.write(json.dumps(words) + "\n")
-    sys.stdout.flush()
+    print(json.dumps(words), flush=True)
 
 
 SETTLED_S = 1.0
@@ -180,53 +179,21 @@ class _Child:
 class TwoSides:
     """Two network namespaces, the cable between them, and their processes."""
 
-    def __init__(self, folder: Path) -> None:
-        self._folder = folder
-        self._spaces = {side: f"swarm-{side}-{os.getpid()}" for side in SIDES}
-        self._ends = {side: f"sw{side[0]}{os.getpid() % 1_000_000}" for side in SIDES}
+    def __init__(self, folder: Path, machines: Machines) -> None:
+        self._folder, self._machines = folder, machines
         self._told: queue.SimpleQueue[tuple[_Child, list[object]]] = queue.SimpleQueue()
         self.children: list[_Child] = []
-
-    def __enter__(self) -> TwoSides:
-        east, west = SIDES
-        try:
+        for side in SIDES:
+            issue(folder, f"router.{side}", [ADDRESSES[side]], 2)
+        for role, ids in (("router", "0"), ("keeper", "0"), ("agent", "01"), ("planner", "0")):
             for side in SIDES:
-                issue(self._folder, f"router.{side}", [ADDRESSES[side]], 2)
-                _ip("netns", "add", self._spaces[side])
-            _ip("link", "add", self._ends[east], "type", "veth", "peer", "name", self._ends[west])
-            for side in SIDES:
-                space, end = self._spaces[side], self._ends[side]
-                _ip("link", "set", end, "netns", space)
-                _ip("-n", space, "addr", "add", f"{ADDRESSES[side]}/30", "dev", end)
-                _ip("-n", space, "link", "set", "lo", "up")
-                _ip("-n", space, "link", "set", end, "up")
-            for role, ids in (("router", "0"), ("keeper", "0"), ("agent", "01"), ("planner", "0")):
-                for side in SIDES:
-                    for id in ids:
-                        self._start(side, role, id)
-                if role == "router":
-                    self.wait_until(lambda: all(child.newest[0] > 0 for child in self.children), _SETTLE_START_S)
-        except BaseException:
-            self.__exit__()
-            raise
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        for child in reversed(self.children):
-            with contextlib.suppress(OSError):
-                child.process.stdin.close()  # type: ignore[union-attr]
-        for child in reversed(self.children):
-            try:
-                child.process.wait(5)
-            except subprocess.TimeoutExpired:
-                child.process.kill()
-                child.process.wait(5)
-        for space in self._spaces.values():
-            subprocess.run(["ip", "netns", "del", space], capture_output=True, check=False)
+                for id in ids:
+                    self._start(side, role, id)
+            if role == "router":
+                self.wait_until(lambda: all(child.newest[0] > 0 for child in self.children), _SETTLE_START_S)
 
     def cable(self, up: bool) -> None:
-        side = SIDES[0]
-        _ip("-n", self._spaces[side], "link", "set", self._ends[side], "up" if up else "down")
+        self._machines.cable(SIDES[0], up)
 
     def say(self, word: str) -> None:
         """Sends a word to all authors."""
@@ -271,12 +238,9 @@ class TwoSides:
 
     def _start(self, side: str, role: str, id: str) -> None:
         name = f"{side}-{role}-{id}"
-        here = [sys.executable, "-m", __name__, side, role, id, str(self._folder)]
-        command = ["ip", "netns", "exec", self._spaces[side], *here]
+        command = [sys.executable, "-m", __name__, side, role, id, str(self._folder)]
         with (self._folder / f"{name}.log").open("w") as log:
-            process = subprocess.Popen(
-                command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=log, text=True
-            )
+            process = self._machines.start(side, command, stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=log)
         child = _Child(name, process, author=role == "agent", replica=role != "router")
         self.children.append(child)
         threading.Thread(target=self._hear, args=(child,), daemon=True).start()
@@ -289,7 +253,8 @@ class TwoSides:
 
 def partitions(count: int, seconds: float, folder: Path) -> Generator[dict[str, float]]:
     """For each round: seconds from the cable's return until all are equal, and the number of digests before it."""
-    with TwoSides(folder) as sides:
+    with machines(ADDRESSES, os.environ) as spaces:
+        sides = TwoSides(folder, spaces)
         sides.say("write")
         sides.listen(1.0)
         sides.say("hush")
@@ -307,12 +272,6 @@ def partitions(count: int, seconds: float, folder: Path) -> Generator[dict[str, 
             since_s = sides.equal_since()
             assert since_s is not None
             yield {"equal_after_s": round(max(since_s - healed_s, 0.0), 3), "digests_apart": apart}
-
-
-def _ip(*arguments: str) -> None:
-    done = subprocess.run(["ip", *arguments], capture_output=True, text=True, check=False)
-    if done.returncode:
-        raise SwarmError(f"ip {' '.join(arguments)}: {done.stderr.strip()}")
 
 
 @benchmark()

@@ -40,6 +40,14 @@ def test_costs_along_parents_are_sums_and_circles_cost_inf() -> None:
     np.testing.assert_array_equal(rivals.costs_along(pace, parents, 0), [[0, 1, 3, np.inf, np.inf]])
 
 
+@pytest.mark.parametrize("field", FIELDS)
+def test_searches_for_one_path_cost_what_our_tree_says(field: str) -> None:
+    report = bench("pursuit", "--size", "64", "--moves", "60", "--field", field)
+    ours, *others = report["rows"]
+    assert [each["by"] for each in others] == ["A*", "MT-D* Lite"]
+    assert ours["over_ours"] == 1
+
+
 def test_places_grow_as_far_as_their_askers() -> None:
     report = bench("places", "--size", "256", "--goals", "20")
     near, *_, anywhere = report["rows"]
