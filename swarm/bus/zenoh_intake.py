@@ -25,16 +25,8 @@ from swarm.bus.bus import (
     newest_of,
 )
 from swarm.errors import ProtocolError
+from swarm.wire import codec
 from swarm.wire.access import Act, Authenticator, check_code
-from swarm.wire.codec import (
-    JSON_ENCODING,
-    KEY_FIELD,
-    decode,
-    decode_many,
-    decode_parameters,
-    may_be_json,
-    packed_json,
-)
 from swarm.wire.meant_key import SHARED, check_meant, check_named
 from swarm.wire.messages import Message
 from swarm.wire.topics import Topic, check_size
@@ -142,7 +134,7 @@ def guarded(callback: Callable[..., None]) -> Callable[..., None]:
 def is_json(carrier: Any, payload: bytes) -> bool:
     """Returns True if the encoding of a sample or query is JSON. The lookup costs more than reading the first
     byte."""
-    return may_be_json(payload) and str(carrier.encoding).partition(";")[0] == JSON_ENCODING
+    return codec.may_be_json(payload) and str(carrier.encoding).partition(";")[0] == codec.JSON_ENCODING
 
 
 def timeout_of(stated: str) -> float:
@@ -186,7 +178,7 @@ class Intake:
         try:
             named = self.fields(topic, key)
             packed = self._checked(topic, key, sample, payload)
-            message = decode(packed, topic.message)
+            message = codec.decode(packed, topic.message)
             topic.check_key(named, message)
         except ProtocolError as error:
             self.drop(topic.name, key, error)
@@ -197,7 +189,7 @@ class Intake:
         """Keys below the namespace and messages of samples, without those that are rejected."""
         keyed = list(self._packed(topic, samples))
         keys = [key for key, _ in keyed]
-        decoded = decode_many([payload for _, payload in keyed], topic.message)
+        decoded = codec.decode_many([payload for _, payload in keyed], topic.message)
         accepted: list[tuple[str, Message]] = []
         for key, message in zip(keys, decoded, strict=True):
             if isinstance(message, ProtocolError):
@@ -240,20 +232,20 @@ class Intake:
         assert wanted is not None
         check_size(asked, topic.ask_bytes)
         if query.payload is None:
-            check_named(self.below(key), parameters.pop(KEY_FIELD, None))
+            check_named(self.below(key), parameters.pop(codec.KEY_FIELD, None))
             self.check(topic, "ask", key, query, asked)
-            return decode_parameters(parameters, wanted)
-        packed = packed_json(asked, wanted) if is_json(query, asked) else asked
+            return codec.decode_parameters(parameters, wanted)
+        packed = codec.packed_json(asked, wanted) if is_json(query, asked) else asked
         check_meant(self.below(key), packed)
         self.check(topic, "ask", key, query, asked)
-        return decode(packed, wanted)
+        return codec.decode(packed, wanted)
 
     def _checked(self, topic: Topic, key: str, sample: zenoh.Sample, payload: bytes) -> bytes:
         """A payload as MessagePack, which is short enough, is meant for its key and has the code that its topic
         needs. Raises ProtocolError."""
         check_size(payload, topic.put_bytes)
         in_json = is_json(sample, payload)
-        packed = packed_json(payload, topic.message, self.fields(topic, key)) if in_json else payload
+        packed = codec.packed_json(payload, topic.message, self.fields(topic, key)) if in_json else payload
         check_meant(self.below(key), packed, must=in_json and topic.message in SHARED)
         self.check(topic, "put", key, sample, payload)
         return packed
