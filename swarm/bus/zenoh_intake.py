@@ -15,15 +15,7 @@ from typing import Any
 
 import zenoh
 
-from swarm.bus.bus import (
-    LONGEST_TIMEOUT_S,
-    TIMEOUT_PARAMETER,
-    USUAL_TIMEOUT_S,
-    Heard,
-    counter_of,
-    new_counts,
-    newest_of,
-)
+from swarm.bus import bus
 from swarm.errors import ProtocolError
 from swarm.wire import codec
 from swarm.wire.access import Act, Authenticator, check_code
@@ -140,14 +132,14 @@ def is_json(carrier: Any, payload: bytes) -> bool:
 def timeout_of(stated: str) -> float:
     """The timeout that a query states, within bounds. Raises ProtocolError if it is not a positive number."""
     if not stated:
-        return USUAL_TIMEOUT_S
+        return bus.USUAL_TIMEOUT_S
     try:
         timeout_s = float(stated)
     except ValueError:
         timeout_s = 0.0
     if not timeout_s > 0:  # neither is NaN
-        raise ProtocolError(f"{TIMEOUT_PARAMETER} {stated[:40]!r} is not a positive number of seconds")
-    return min(timeout_s, LONGEST_TIMEOUT_S)
+        raise ProtocolError(f"{bus.TIMEOUT_PARAMETER} {stated[:40]!r} is not a positive number of seconds")
+    return min(timeout_s, bus.LONGEST_TIMEOUT_S)
 
 
 log = logging.getLogger(__name__)
@@ -167,13 +159,13 @@ class Intake:
     def __init__(self, namespace: str, authenticator: Authenticator | None) -> None:
         self._namespace, self._start = namespace, f"{namespace}/"
         self.authenticator = authenticator
-        self.counts = new_counts()
+        self.counts = bus.new_counts()
         self._counting = threading.Lock()
         """Held to add to `counts`."""
         self._logged_s: dict[tuple[str, str], float] = {}
         """Topic and counter -> when such a dropped payload was last logged, by the monotonic clock."""
 
-    def _event_of(self, topic: Topic, key: str, sample: zenoh.Sample, payload: bytes) -> Heard | None:
+    def _event_of(self, topic: Topic, key: str, sample: zenoh.Sample, payload: bytes) -> bus.Heard | None:
         """The event of a sample; None, counted and logged, if it is rejected."""
         try:
             named = self.fields(topic, key)
@@ -183,7 +175,7 @@ class Intake:
         except ProtocolError as error:
             self.drop(topic.name, key, error)
             return None
-        return Heard(topic, named, message)
+        return bus.Heard(topic, named, message)
 
     def together(self, topic: Topic, samples: list[zenoh.Sample]) -> list[tuple[str, Message]]:
         """Keys below the namespace and messages of samples, without those that are rejected."""
@@ -198,10 +190,10 @@ class Intake:
                 accepted.append((self.below(key), message))
         return accepted
 
-    def newest(self, topic: Topic, samples: list[zenoh.Sample]) -> list[Heard]:
+    def newest(self, topic: Topic, samples: list[zenoh.Sample]) -> list[bus.Heard]:
         """The events of the newest sample under each key, without those that are rejected."""
         keyed = ((each[0], each) for each in self._own(samples))
-        return newest_of(topic, keyed, lambda waited: self._event_of(topic, *waited))
+        return bus.newest_of(topic, keyed, lambda waited: self._event_of(topic, *waited))
 
     def _own(self, samples: list[zenoh.Sample]) -> list[tuple[str, zenoh.Sample, bytes]]:
         """Keys, samples and payloads of those in our namespace: `patterned` hears others, too."""
@@ -286,7 +278,7 @@ class Intake:
 
         name  of the topic, or what else it belongs to
         """
-        kind, now_s = (name, counter_of(error)), time.monotonic()
+        kind, now_s = (name, bus.counter_of(error)), time.monotonic()
         with self._counting:
             self.counts[kind[1]] += 1
         if now_s - self._logged_s.get(kind, -_LOG_AGAIN_S) >= _LOG_AGAIN_S:
