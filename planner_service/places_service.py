@@ -234,7 +234,7 @@ class PlacesService(PlanningProcess):
         self.counters.gauge("places_waiting", float(len(self._waiting)))
         self.counters.gauge("place_trees", float(sum(each.trees.trees for each in self._classes.values())))
         self.counters.gauge("place_bytes", float(sum(each.trees.bytes for each in self._classes.values())))
-        self._obedience.tick(now_ns)
+        self._order_client.tick(now_ns)
         self._go_on()
         self._member.tick(now_ns)
 

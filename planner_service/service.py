@@ -216,7 +216,7 @@ class PlannerService(PlanningProcess):
         self._drop_unused(now_ns)
         for planner in self._planners.values():
             self._perform(planner, planner.tick(now_ns), now_ns)
-        self._obedience.tick(now_ns)
+        self._order_client.tick(now_ns)
         self._forced = False
         self._answer(now_ns)
         for name in ("marks_merged", "sets_foreign"):
@@ -337,7 +337,7 @@ class PlannerService(PlanningProcess):
 
     def _obey(self) -> None:
         """Applies orders."""
-        book, scenario = self._obedience.book, self._scenario
+        book, scenario = self._order_client.book, self._scenario
         if book.version == self._obeyed_version:
             return
         self._obeyed_version = book.version
@@ -352,7 +352,7 @@ class PlannerService(PlanningProcess):
 
     def _pace(self, planner: Planner) -> None:
         """Sets a planner's pace as it is ordered."""
-        book, scenario = self._obedience.book, self._scenario
+        book, scenario = self._order_client.book, self._scenario
         self._search.time_scale = book.setting("time_scale", scenario.time_scale)
         planner.set_pace(
             book.setting("planner.cpu_budget", scenario.planner.cpu_budget),
@@ -361,7 +361,7 @@ class PlannerService(PlanningProcess):
 
     def _obeys(self, order: Obey) -> bool:
         if order.subject is not None:
-            return self._obeyed_version == self._obedience.book.version
+            return self._obeyed_version == self._order_client.book.version
         # A zone may be for one class alone; trees of all classes must know of it.
         knows_map = all(planner.knows_map for planner in self._planners.values())
         return self._sync.holds(order.author, order.sets, self._now_ns) and knows_map

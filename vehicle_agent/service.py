@@ -85,7 +85,7 @@ class AgentService:
         self.counters = self._member.counters
         for name in _COUNTED_FROM_0:
             self.counters.count(name, 0)
-        self._obedience = OrderClient(setup, bus, post, self._obeys, self.agent.goals.book)
+        self._order_client = OrderClient(setup, bus, post, self._obeys, self.agent.goals.book)
         self._places_job = place_job(setup.scenario, self.agent.plan.group.name)
         """The process that plans to places for the group."""
         self._obeyed_version = 0
@@ -102,7 +102,7 @@ class AgentService:
         self._removed: set[str] = set()
         """Vehicles that an operator has let leave in this generation."""
         self._member.needs("the shared map", lambda: self._sync.joined)
-        self._member.needs("the orders of this run", lambda: self._obedience.known)
+        self._member.needs("the orders of this run", lambda: self._order_client.known)
         self._member.needs("places for its vehicles", lambda: self._has_places)
 
     @property
@@ -130,7 +130,7 @@ class AgentService:
         self._right_of_way.start(now_ns)  # peers send a query as soon as they see this token
         self._member.join()
         self._sync.start(now_ns)
-        self._obedience.start(now_ns)
+        self._order_client.start(now_ns)
         bus.collect(topics.POSE)
         if not self._parts.flies:  # obstacles are on the ground
             bus.collect(topics.OBSTACLE)
@@ -156,7 +156,7 @@ class AgentService:
             if awaited:
                 self._act(now_ns)
             return
-        if self._right_of_way.on_cells_event(event, now_ns) or self._obedience.on_order_event(event, now_ns):
+        if self._right_of_way.on_cells_event(event, now_ns) or self._order_client.on_order_event(event, now_ns):
             return
         match event:
             case Asked(topic=topic, request=RemoveVehicles() as request) if topic is topics.LEAVE:
@@ -202,7 +202,7 @@ class AgentService:
         self._now_ns = self._acted_ns = now_ns
         agent, parts = self.agent, self._parts
         agent.obstacles.tick(now_ns)
-        targets = self._obedience.book.targets(self._setup.scenario)
+        targets = self._order_client.book.targets(self._setup.scenario)
         for pose in self._collected(topics.POSE, planning.TargetPose):
             if pose.target in targets:  # a stranger may name any number of others
                 self._on_pose(pose, now_ns)
@@ -276,7 +276,7 @@ class AgentService:
 
     def _obey(self, now_ns: int) -> None:
         """Applies orders."""
-        orders, agent = self._obedience, self.agent
+        orders, agent = self._order_client, self.agent
         agent.stopped = orders.book.stopped if orders.known else lambda vehicle: True
         if self._obeyed_version != orders.book.version:
             self._obeyed_version = orders.book.version
@@ -295,7 +295,7 @@ class AgentService:
         if order.goals:
             return self.agent.goals_taken
         if order.subject is not None:
-            return self._obeyed_version == self._obedience.book.version
+            return self._obeyed_version == self._order_client.book.version
         return self._sync.holds(order.author, order.sets, self._now_ns)
 
     def _tell_goals(self, now_ns: int) -> None:
@@ -439,7 +439,7 @@ class AgentService:
             self._planners_changed = False
             alive = self._roster.alive("planner")
             chased = {vehicle.target for vehicle in self.agent.vehicles.values()}
-            known = chased.union(self._obedience.book.targets(self._setup.scenario))
+            known = chased.union(self._order_client.book.targets(self._setup.scenario))
             planners = {job_of(id): alive[id] for id in sorted(alive, reverse=True) if job_of(id) in known}
             places = self._roster.alive("places")
             if own := [id for id in sorted(places) if job_of(id) == self._places_job]:
