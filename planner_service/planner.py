@@ -27,15 +27,7 @@ from swarm.config.vehicle_classes import GROUND
 from swarm.grid import Window
 from swarm.runtime.stats import Counters
 from swarm.wire.fields import MOST_VEHICLES, pack_column
-from swarm.wire.messages.planning import (
-    Believed,
-    CostReply,
-    CostRequest,
-    PlannerStatus,
-    PushedRoute,
-    RouteReply,
-    RouteRequest,
-)
+from swarm.wire.messages import planning
 from swarm.wire.messages.vehicles import Chasers
 from swarm.wire.route_columns import Route, RouteBatch
 
@@ -69,8 +61,8 @@ class Work:
     job: Callable[[], GrownTree] | Callable[[], StrideNetwork]
 
 
-Answer = RouteReply | CostReply | Refusal
-Action = Work | PushedRoute | PlannerStatus | Believed
+Answer = planning.RouteReply | planning.CostReply | Refusal
+Action = Work | planning.PushedRoute | planning.PlannerStatus | planning.Believed
 """Action of a planner: a search to run, or a message to publish."""
 
 COUNTS = ("routes_served", "growths", "window_growths", "pushes", "costs_served", "growths_late")
@@ -180,7 +172,7 @@ class Planner:
 
     def answer(
         self,
-        request: RouteRequest | CostRequest,
+        request: planning.RouteRequest | planning.CostRequest,
         now_ns: int,
         send: Callable[[Answer], None] = lambda answer: None,
     ) -> Answer:
@@ -189,7 +181,7 @@ class Planner:
 
         send  called with the reply as soon as it is known: the asker does not wait for statistics
         """
-        if isinstance(request, CostRequest):
+        if isinstance(request, planning.CostRequest):
             answer: Answer = self._costs(request, now_ns)
         elif len(request.cells) > MOST_ROUTES:
             answer = Refusal(f"{len(request.cells)} routes at once, at most {MOST_ROUTES}: ask in parts")
@@ -370,7 +362,9 @@ class Planner:
 
     # --- answers ------------------------------------------------------------------------------------------------
 
-    def _routes(self, request: RouteRequest, now_ns: int, send: Callable[[Answer], None]) -> RouteReply:
+    def _routes(
+        self, request: planning.RouteRequest, now_ns: int, send: Callable[[Answer], None]
+    ) -> planning.RouteReply:
         cells = self._cells(request)
         most = (MOST_STEPS if self._puller is None else MOST_PULLED_STEPS) // max(len(cells), 1)
         max_cells = min(request.max_cells or most, most) if most < self._grid.cells else request.max_cells
@@ -384,7 +378,7 @@ class Planner:
             if request.force and self.tree.ready and self._force(self._improvable(cells, routes), now_ns):
                 routes = self._read(cells, max_cells, now_ns)
         given = self._pulled(routes)
-        reply = RouteReply(
+        reply = planning.RouteReply(
             rows=self._grid.rows, cols=self._grid.cols, routes=given.columns(), **self._reply_fields(now_ns)
         )
         send(reply)
@@ -449,7 +443,7 @@ class Planner:
             self._full_due_ns = now_ns + self._push_ns
             self._wants_full = True
 
-    def _costs(self, request: CostRequest, now_ns: int) -> CostReply | Refusal:
+    def _costs(self, request: planning.CostRequest, now_ns: int) -> planning.CostReply | Refusal:
         cells = self._cells(request)
         costs_s = self.tree.cost_to_go_at(cells)
         if self.tree.ready and self.tree.may_reach(cells, costs_s):
@@ -458,7 +452,7 @@ class Planner:
         if (search := self._under_way) is not None:
             on_map = [0 <= cell < self._grid.cells and self.tree.cost_grid.passable(cell) for cell in cells]
             costs_s = search.costs_s(costs_s, np.array(on_map, np.bool_))
-        return CostReply(cost_to_go_s=pack_column(costs_s, "<f4"), **self._reply_fields(now_ns))
+        return planning.CostReply(cost_to_go_s=pack_column(costs_s, "<f4"), **self._reply_fields(now_ns))
 
     def _fields(self, now_ns: int) -> dict[str, Any]:
         """Returns the fields about tree and target in replies and the status."""
@@ -476,7 +470,7 @@ class Planner:
         own = {"target_cell": self.tree.target_cell, "vehicle_class": self.vehicle_class}
         return self._fields(now_ns) | own | {"lethal_target": lethal, "nearest_cell": nearest}
 
-    def _cells(self, request: RouteRequest | CostRequest) -> list[int]:
+    def _cells(self, request: planning.RouteRequest | planning.CostRequest) -> list[int]:
         """The cells asked for; a person's row and col come last, as -1 where they are outside."""
         if request.row is None or request.col is None:
             return request.cells
@@ -523,8 +517,8 @@ class Planner:
         at, most = follower.cell, follower.max_cells
         return self._known(lambda: searcher.route(self._ways, id, at, most, self.tree.map_version), now_ns)
 
-    def _pushed(self, vehicle: str, route: Route, target_cell: int) -> PushedRoute:
-        return PushedRoute(
+    def _pushed(self, vehicle: str, route: Route, target_cell: int) -> planning.PushedRoute:
+        return planning.PushedRoute(
             vehicle=vehicle,
             target=self.target,
             incarnation=self._incarnation,
@@ -533,10 +527,10 @@ class Planner:
             route=route,
         )
 
-    def status(self, now_ns: int) -> PlannerStatus:
+    def status(self, now_ns: int) -> planning.PlannerStatus:
         window, counts, pose = self._window, self.counters.counts, self._watch.pose
         mean, p95, highest = self._gaps.last or (None, None, None)
-        return PlannerStatus(
+        return planning.PlannerStatus(
             **self._fields(now_ns),
             stamp_ns=now_ns,
             strategy=self._config.strategy,

@@ -69,7 +69,7 @@ class PlanningProcess:
         self._replica = MapReplica(terrain.grid, self._maps, filter=self._mark_filter)
         self._sync = MapSync(self._replica, bus, post, scenario.map, setup.role, at_ticks=True)
         self._learned = LearnedGauges(cost_map.keys, self.counters)
-        self._obedience = OrderClient(setup, bus, post, self._obeys)
+        self._order_client = OrderClient(setup, bus, post, self._obeys)
         self._leads = False
         self._now_ns = 0
         self._member.needs("the shared map", lambda: self._sync.joined)
@@ -94,7 +94,7 @@ class PlanningProcess:
     def start(self, now_ns: int) -> None:
         self._member.join()
         self._sync.start(now_ns)
-        self._obedience.start(now_ns)
+        self._order_client.start(now_ns)
         self._candidacy.start()
         self._lead(self._candidacy.leads, now_ns)
 
@@ -104,7 +104,7 @@ class PlanningProcess:
             handlers = (
                 self._sync.on_map_event,
                 self._candidacy.on_election_event,
-                self._obedience.on_order_event,
+                self._order_client.on_order_event,
             )
             any(takes(event, now_ns) for takes in handlers)
 

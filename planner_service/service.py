@@ -25,6 +25,7 @@ from swarm.clock import NS_PER_S
 from swarm.config.vehicle_classes import GROUND
 from swarm.liveness import job_of
 from swarm.plugins.find import named_plugin
+from swarm.wire import topics
 from swarm.wire.messages.orders import Obey
 from swarm.wire.messages.planning import (
     Believed,
@@ -36,19 +37,6 @@ from swarm.wire.messages.planning import (
     TargetPose,
 )
 from swarm.wire.messages.vehicles import Chasers, Fleet
-from swarm.wire.topics import (
-    BELIEVED,
-    CHASERS,
-    COST,
-    FLEET,
-    NAMELESS_COST,
-    NAMELESS_ROUTE,
-    POSE,
-    ROUTE,
-    SIGHTED,
-    STATUS,
-    is_own,
-)
 
 log = logging.getLogger(__name__)
 
@@ -84,7 +72,7 @@ class PlannerService(PlanningProcess):
         scenario, self._target = setup.scenario, job_of(setup.id)
         self._heard_groups = readable_for_target(scenario, self._target)
         key = {"target": self._target}
-        served = dict.fromkeys((ROUTE, COST, NAMELESS_ROUTE, NAMELESS_COST), key)
+        served = dict.fromkeys((topics.ROUTE, topics.COST, topics.NAMELESS_ROUTE, topics.NAMELESS_COST), key)
         super().__init__(planning, self._heard_groups, served, all_kernels)
         self._stopwatch, self._prepared = stopwatch, prepared
         # Position of the target.
@@ -187,8 +175,8 @@ class PlannerService(PlanningProcess):
         if self._untracked:
             self._listen(True)
         else:
-            self._bus.collect(POSE, target=self._target)
-        self._bus.collect(CHASERS, target=self._target)
+            self._bus.collect(topics.POSE, target=self._target)
+        self._bus.collect(topics.CHASERS, target=self._target)
         super().start(now_ns)
 
     def handle(self, event: Event, now_ns: int) -> None:
@@ -228,7 +216,7 @@ class PlannerService(PlanningProcess):
         self._drop_unused(now_ns)
         for planner in self._planners.values():
             self._perform(planner, planner.tick(now_ns), now_ns)
-        self._obedience.tick(now_ns)
+        self._order_client.tick(now_ns)
         self._forced = False
         self._answer(now_ns)
         for name in ("marks_merged", "sets_foreign"):
@@ -261,10 +249,10 @@ class PlannerService(PlanningProcess):
             self._member.alarms.end("no-tracker", self._target, now_ns)
 
     def _take_collected(self, now_ns: int) -> None:
-        for heard in self._bus.collected(POSE):
+        for heard in self._bus.collected(topics.POSE):
             assert isinstance(heard.message, TargetPose)
             self._watch.on_pose(heard.message, now_ns)
-        for heard in self._bus.collected(CHASERS):
+        for heard in self._bus.collected(topics.CHASERS):
             assert isinstance(heard.message, Chasers)
             name = heard.message.vehicle_class
             if self._fault_of(name) is None and (heard.message.ids or name in self._planners):
@@ -295,7 +283,7 @@ class PlannerService(PlanningProcess):
             self._listen(self._watch.lost(now_ns))
         if not self._listens:
             return
-        for heard in self._bus.collected(FLEET):
+        for heard in self._bus.collected(topics.FLEET):
             assert isinstance(heard.message, Fleet)
             self._presence.receive(heard.message, now_ns)
         self._presence.expire(now_ns)
@@ -307,11 +295,11 @@ class PlannerService(PlanningProcess):
             return
         self._listens = listens
         if listens:
-            self._bus.subscribe(SIGHTED, self._post, target=self._target)
-            self._bus.collect(FLEET)
+            self._bus.subscribe(topics.SIGHTED, self._post, target=self._target)
+            self._bus.collect(topics.FLEET)
         else:
-            self._bus.unsubscribe(SIGHTED, target=self._target)
-            self._bus.unsubscribe(FLEET)
+            self._bus.unsubscribe(topics.SIGHTED, target=self._target)
+            self._bus.unsubscribe(topics.FLEET)
 
     def _answer(self, now_ns: int) -> None:
         """Answers queries. If there will be a tree to answer from soon, a query waits for that, but not long.
@@ -321,7 +309,7 @@ class PlannerService(PlanningProcess):
         """
         held, self._held = self._held, []
         spent = 0
-        for n, (asked_ns, event) in enumerate(sorted(held, key=lambda each: not is_own(each[1].asker))):
+        for n, (asked_ns, event) in enumerate(sorted(held, key=lambda each: not topics.is_own(each[1].asker))):
             request = event.request
             assert isinstance(request, RouteRequest | CostRequest)
             name = request.vehicle_class
@@ -336,7 +324,7 @@ class PlannerService(PlanningProcess):
                 self._held.append((asked_ns, event))
                 continue
             spent += (len(request.cells) + 1) * (_ROUTE_COST if isinstance(request, RouteRequest) else 1)
-            if isinstance(request, RouteRequest) and request.force and not is_own(event.asker):
+            if isinstance(request, RouteRequest) and request.force and not topics.is_own(event.asker):
                 request, self._forced = msgspec.structs.replace(request, force=not self._forced), True
             planner.answer(request, now_ns, partial(self._send, event))
 
@@ -349,7 +337,7 @@ class PlannerService(PlanningProcess):
 
     def _obey(self) -> None:
         """Applies orders."""
-        book, scenario = self._obedience.book, self._scenario
+        book, scenario = self._order_client.book, self._scenario
         if book.version == self._obeyed_version:
             return
         self._obeyed_version = book.version
@@ -364,7 +352,7 @@ class PlannerService(PlanningProcess):
 
     def _pace(self, planner: Planner) -> None:
         """Sets a planner's pace as it is ordered."""
-        book, scenario = self._obedience.book, self._scenario
+        book, scenario = self._order_client.book, self._scenario
         self._search.time_scale = book.setting("time_scale", scenario.time_scale)
         planner.set_pace(
             book.setting("planner.cpu_budget", scenario.planner.cpu_budget),
@@ -373,7 +361,7 @@ class PlannerService(PlanningProcess):
 
     def _obeys(self, order: Obey) -> bool:
         if order.subject is not None:
-            return self._obeyed_version == self._obedience.book.version
+            return self._obeyed_version == self._order_client.book.version
         # A zone may be for one class alone; trees of all classes must know of it.
         knows_map = all(planner.knows_map for planner in self._planners.values())
         return self._sync.holds(order.author, order.sets, self._now_ns) and knows_map
@@ -397,7 +385,7 @@ class PlannerService(PlanningProcess):
         """Publishes the status of "ground", with the vehicles of all classes."""
         following = sum(len(planner.followers) for planner in self._planners.values())
         told = msgspec.structs.replace(status, following=following)
-        self._bus.publish(STATUS, told, target=self._target)
+        self._bus.publish(topics.STATUS, told, target=self._target)
 
     def _perform(self, planner: Planner, actions: list[Action], now_ns: int) -> None:
         name = planner.vehicle_class
@@ -412,4 +400,4 @@ class PlannerService(PlanningProcess):
                 case PlannerStatus() as status:
                     self._tell_status(status)
                 case Believed() as believed:
-                    self._bus.publish(BELIEVED, believed, target=self._target)
+                    self._bus.publish(topics.BELIEVED, believed, target=self._target)

@@ -17,18 +17,7 @@ from swarm.liveness import Peer
 from swarm.right_of_way.holdings import Tell, Wish
 from swarm.right_of_way.host import AskKnown
 from swarm.runtime.role_setup import RoleSetup
-from swarm.wire.messages import Message
-from swarm.wire.messages.traffic import (
-    Claim,
-    Granted,
-    HostState,
-    Known,
-    KnownRequest,
-    Left,
-    Stored,
-    Table,
-    Word,
-)
+from swarm.wire.messages import Message, traffic
 from swarm.wire.topics import GRANTED, HOST_STATE, KNOWN, LEFT, STORED, TABLE, WORD, Topic
 from vehicle_agent.promise_store import PromiseStore
 from vehicle_agent.traffic.right_of_way_core import Action, OwnRecord, RightOfWay
@@ -153,20 +142,20 @@ class RightOfWaySync:
         core, own_ns = self.core, self._own_time.at(now_ns)
         core.silent = not self.store.ready
         match event:
-            case Heard(message=Table() as table):
+            case Heard(message=traffic.Table() as table):
                 self._take_standings(now_ns)  # by which it is judged
                 self._perform(core.hear_table(table, own_ns))
-            case Heard(message=Stored() as stored):
+            case Heard(message=traffic.Stored() as stored):
                 self._perform(core.hear_stored(stored, own_ns))
-            case Asked(topic=topic, request=Claim() as claim) if topic is TABLE:
+            case Asked(topic=topic, request=traffic.Claim() as claim) if topic is TABLE:
                 self._hear_claim(event, claim.epoch, own_ns)
                 event.end()
-            case Asked(topic=topic, request=KnownRequest() as request) if topic is KNOWN:
+            case Asked(topic=topic, request=traffic.KnownRequest() as request) if topic is KNOWN:
                 self._answer(event, core.answer_known(request))
                 event.end()
-            case Replied(topic=topic, fields=fields, tag=tag, message=Table() as table) if topic is TABLE:
+            case Replied(topic=topic, fields=fields, tag=tag, message=traffic.Table() as table) if topic is TABLE:
                 core.hear_promise(fields["agent"], int(tag.rpartition("-")[2]), table, own_ns)
-            case Replied(message=Known() as known, took_s=took_s, tag=tag):
+            case Replied(message=traffic.Known() as known, took_s=took_s, tag=tag):
                 if known.agent in core.shards.agents:
                     core.trips.measure(known.agent, int(took_s * NS_PER_S))
                 if tag == self._known_tag:
@@ -195,24 +184,24 @@ class RightOfWaySync:
         """Returns True if a vehicle may be waiting for this message."""
         holdings = self.core.host
         match message:
-            case Left():
+            case traffic.Left():
                 return holdings.waits
-            case Granted(grants=grants):
+            case traffic.Granted(grants=grants):
                 return any(len(entries) > 1 and len(holdings.path(id)) < 2 for id, entries in grants.items())
-            case Word(shard=shard):
+            case traffic.Word(shard=shard):
                 return holdings.is_pending(shard)
-            case HostState(vehicles=stands):
+            case traffic.HostState(vehicles=stands):
                 return any(stand.better for stand in stands)
         return False
 
     def hear(self, message: Message, now_ns: int) -> list[str]:
         """Takes up what a host or a leader says. Returns the vehicles that have found their places by it."""
         match message:
-            case Left():
+            case traffic.Left():
                 return self.core.host.hear_left(message)
-            case Granted() | Word():
+            case traffic.Granted() | traffic.Word():
                 return self.core.host.hear_granted(message, self._own_time.at(now_ns))
-            case HostState():
+            case traffic.HostState():
                 self.core.hear_host_state(message, self._own_time.at(now_ns))
         return []
 
@@ -286,7 +275,7 @@ class RightOfWaySync:
         """Asks all agents what they know of us, and schedules the next query: each after twice the delay, up to a
         limit."""
         shards = self.core.shards
-        request = KnownRequest(
+        request = traffic.KnownRequest(
             agent=self._id, disk=self.store.own.disk, layer=shards.layer, shard_cells=shards.side
         )
         self._known_tag = self._known_tag or f"known-{now_ns}"
@@ -314,15 +303,15 @@ class RightOfWaySync:
         """Performs the actions that come first, and replies with the last."""
         for action in actions:
             match action:
-                case Table():
+                case traffic.Table():
                     member = asked.fields["member"]
                     asked.answer(replace(action, agent=self._id), shard=action.shard, member=member, agent=self._id)
-                case Known():
+                case traffic.Known():
                     asked.answer(action, agent=self._id)
                 case _:
                     self._perform([action])
 
-    def _tell_members(self, topic: Topic, message: Table | Stored) -> None:
+    def _tell_members(self, topic: Topic, message: traffic.Table | traffic.Stored) -> None:
         """Sends a message to each other member of the shard."""
         for member in self.core.shards.members(message.shard):
             if member != self._id:
@@ -345,20 +334,20 @@ class RightOfWaySync:
                 case Tell(members, standing):
                     for member in members:
                         self.bus.publish(HOST_STATE, standing, shard=standing.shard, member=member, agent=self._id)
-                case Left():
+                case traffic.Left():
                     self.bus.publish(LEFT, action, host=action.host, agent=self._id)
-                case Granted():
+                case traffic.Granted():
                     self.bus.publish(GRANTED, action, shard=action.shard, host=action.host, agent=self._id)
-                case Word():
+                case traffic.Word():
                     self.bus.publish(WORD, action, shard=action.shard, host=action.host, agent=self._id)
-                case Table():
+                case traffic.Table():
                     self._tell_members(TABLE, action)
-                case Stored():
+                case traffic.Stored():
                     self._tell_members(STORED, action)
                 case AskPromises(shard, epoch, members):
                     for member in members:
                         tag = f"promise-{shard}-{epoch}"
-                        claim = Claim(epoch=epoch)
+                        claim = traffic.Claim(epoch=epoch)
                         seats: dict[str, str | int] = {"shard": shard, "member": self._id, "agent": member}
                         self.bus.ask(TABLE, claim, self.post, tag=tag, timeout_s=_PROMISE_TIMEOUT_S, **seats)
                 case Refused(text):

@@ -22,40 +22,12 @@ from swarm.liveness import Roster, job_of
 from swarm.runtime.order_client import OrderClient
 from swarm.runtime.role_setup import RoleSetup
 from swarm.runtime.stats import GAPS_OF, GAPS_TO, UNPROVEN_OF, UNPROVEN_TO
+from swarm.wire import topics
 from swarm.wire.fields import column
-from swarm.wire.messages import Message
+from swarm.wire.messages import Message, planning
 from swarm.wire.messages.orders import GoalState, GoalStates, Obey
-from swarm.wire.messages.planning import (
-    CostReply,
-    CostRequest,
-    PlaceRouteReply,
-    PlaceRouteRequest,
-    PushedRoute,
-    RouteReply,
-    RouteRequest,
-    Sighted,
-    TargetPose,
-)
 from swarm.wire.messages.traffic import Granted, HostState, Left, Word
 from swarm.wire.messages.vehicles import Followed, Obstacle, Removed, RemoveVehicles, SharedCosts, VehicleState
-from swarm.wire.topics import (
-    CHASERS,
-    COST,
-    FLEET,
-    FOLLOWED,
-    GOAL_STATES,
-    LEAVE,
-    OBSTACLE,
-    PLACE_ROUTE,
-    POSE,
-    PUSHED_ROUTE,
-    ROUTE,
-    SENT,
-    SHARED_COSTS,
-    SIGHTED,
-    TRUE_POSE,
-    Topic,
-)
 from vehicle_agent.agent import AgentAction, AskRoutes
 from vehicle_agent.agent_parts import AgentParts
 from vehicle_agent.driving.driven_vehicle import PLACES, Places, goal_of
@@ -113,7 +85,7 @@ class AgentService:
         self.counters = self._member.counters
         for name in _COUNTED_FROM_0:
             self.counters.count(name, 0)
-        self._obedience = OrderClient(setup, bus, post, self._obeys, self.agent.goals.book)
+        self._order_client = OrderClient(setup, bus, post, self._obeys, self.agent.goals.book)
         self._places_job = place_job(setup.scenario, self.agent.plan.group.name)
         """The process that plans to places for the group."""
         self._obeyed_version = 0
@@ -130,7 +102,7 @@ class AgentService:
         self._removed: set[str] = set()
         """Vehicles that an operator has let leave in this generation."""
         self._member.needs("the shared map", lambda: self._sync.joined)
-        self._member.needs("the orders of this run", lambda: self._obedience.known)
+        self._member.needs("the orders of this run", lambda: self._order_client.known)
         self._member.needs("places for its vehicles", lambda: self._has_places)
 
     @property
@@ -158,19 +130,19 @@ class AgentService:
         self._right_of_way.start(now_ns)  # peers send a query as soon as they see this token
         self._member.join()
         self._sync.start(now_ns)
-        self._obedience.start(now_ns)
-        bus.collect(POSE)
+        self._order_client.start(now_ns)
+        bus.collect(topics.POSE)
         if not self._parts.flies:  # obstacles are on the ground
-            bus.collect(OBSTACLE)
+            bus.collect(topics.OBSTACLE)
         self.agent.obstacles.listen_anew(now_ns)
         if untracked := self._detector.untracked:
-            bus.collect(TRUE_POSE)
+            bus.collect(topics.TRUE_POSE)
             for target in sorted(untracked):
-                bus.subscribe(SIGHTED, post, target=target)
-        bus.collect(PUSHED_ROUTE, agent=id)
+                bus.subscribe(topics.SIGHTED, post, target=target)
+        bus.collect(topics.PUSHED_ROUTE, agent=id)
         if self._parts.costs is not None:
-            bus.collect(SHARED_COSTS, group=self.agent.plan.group.name)
-        bus.serve(LEAVE, post, agent=id)
+            bus.collect(topics.SHARED_COSTS, group=self.agent.plan.group.name)
+        bus.serve(topics.LEAVE, post, agent=id)
 
     def handle(self, event: Event, now_ns: int) -> None:
         # Not for links beyond our router: of those anybody may tell, by a token, and no vehicle drives meanwhile.
@@ -184,18 +156,18 @@ class AgentService:
             if awaited:
                 self._act(now_ns)
             return
-        if self._right_of_way.on_cells_event(event, now_ns) or self._obedience.on_order_event(event, now_ns):
+        if self._right_of_way.on_cells_event(event, now_ns) or self._order_client.on_order_event(event, now_ns):
             return
         match event:
-            case Asked(topic=topic, request=RemoveVehicles() as request) if topic is LEAVE:
+            case Asked(topic=topic, request=RemoveVehicles() as request) if topic is topics.LEAVE:
                 event.answer(self._on_leave(request.vehicles), agent=self._setup.id)
                 event.end()
-            case Heard(message=Sighted() as sighted):
+            case Heard(message=planning.Sighted() as sighted):
                 self._on_sighted(sighted, now_ns)
-            case Replied(message=(RouteReply() | PlaceRouteReply()) as reply, took_s=took_s):
+            case Replied(message=(planning.RouteReply() | planning.PlaceRouteReply()) as reply, took_s=took_s):
                 self._answer_s = max(_ANSWER_S, _TRIPS * took_s)
                 self._on_routes(event, reply, now_ns)
-            case Replied(tag=tag, message=CostReply() as reply, took_s=took_s):
+            case Replied(tag=tag, message=planning.CostReply() as reply, took_s=took_s):
                 self._answer_s = max(_ANSWER_S, _TRIPS * took_s)
                 self._on_costs(_number(tag), reply)
             case AskEnded(tag=tag, failure=failure) if tag.startswith(_ROUTES):
@@ -224,25 +196,25 @@ class AgentService:
         """Publishes where the vehicles are, each time that they have driven: between two reports they are where the
         first says."""
         for region, fleet in self._parts.fleet.reports(places, now_ns):
-            self._bus.publish(FLEET, fleet, region=region, author=self._author)
+            self._bus.publish(topics.FLEET, fleet, region=region, author=self._author)
 
     def tick(self, now_ns: int) -> None:
         self._now_ns = self._acted_ns = now_ns
         agent, parts = self.agent, self._parts
         agent.obstacles.tick(now_ns)
-        targets = self._obedience.book.targets(self._setup.scenario)
-        for pose in self._collected(POSE, TargetPose):
+        targets = self._order_client.book.targets(self._setup.scenario)
+        for pose in self._collected(topics.POSE, planning.TargetPose):
             if pose.target in targets:  # a stranger may name any number of others
                 self._on_pose(pose, now_ns)
-        for pose in self._collected(TRUE_POSE, TargetPose):
+        for pose in self._collected(topics.TRUE_POSE, planning.TargetPose):
             self._detector.set_truth(pose, now_ns)
         self._member.tick(now_ns)
         self._sync.tick(now_ns)
-        for pushed in self._collected(PUSHED_ROUTE, PushedRoute):
+        for pushed in self._collected(topics.PUSHED_ROUTE, planning.PushedRoute):
             self.counters.count("routes_pushed")
             self._publish_followed(agent.route_pushed(pushed, now_ns))
         if parts.costs is not None:
-            for costs in self._collected(SHARED_COSTS, SharedCosts):
+            for costs in self._collected(topics.SHARED_COSTS, SharedCosts):
                 parts.costs.receive(costs, now_ns)
         for placed in self._right_of_way.take_granted(now_ns):
             self._place(placed)
@@ -272,9 +244,9 @@ class AgentService:
         chasing = [(id, vehicle.target, paths[id][:kept]) for id, vehicle in agent.vehicles.items()]
         for chasers in parts.chasers.reports(chasing, now_ns):
             if chasers.target is None:
-                self._bus.publish(SENT, chasers, places=self._places_job, author=self._author)
+                self._bus.publish(topics.SENT, chasers, places=self._places_job, author=self._author)
             else:
-                self._bus.publish(CHASERS, chasers, target=chasers.target, author=self._author)
+                self._bus.publish(topics.CHASERS, chasers, target=chasers.target, author=self._author)
         self._right_of_way.tick(agent.wishes, now_ns)
         self._member.tell_faults(parts.faults, now_ns)
         states = bytes([vehicle.state for vehicle in agent.vehicles.values()])
@@ -294,7 +266,7 @@ class AgentService:
             self._right_of_way.tick(self.agent.wishes, now_ns)
         self._member.publish_stats(now_ns)
 
-    def _collected(self, topic: Topic, kind: type[M]) -> Iterator[M]:
+    def _collected(self, topic: topics.Topic, kind: type[M]) -> Iterator[M]:
         """Returns the messages that the bus has kept on a topic since the last tick."""
         for heard in self._bus.collected(topic):
             assert isinstance(heard.message, kind)
@@ -304,7 +276,7 @@ class AgentService:
 
     def _obey(self, now_ns: int) -> None:
         """Applies orders."""
-        orders, agent = self._obedience, self.agent
+        orders, agent = self._order_client, self.agent
         agent.stopped = orders.book.stopped if orders.known else lambda vehicle: True
         if self._obeyed_version != orders.book.version:
             self._obeyed_version = orders.book.version
@@ -323,7 +295,7 @@ class AgentService:
         if order.goals:
             return self.agent.goals_taken
         if order.subject is not None:
-            return self._obeyed_version == self._obedience.book.version
+            return self._obeyed_version == self._order_client.book.version
         return self._sync.holds(order.author, order.sets, self._now_ns)
 
     def _tell_goals(self, now_ns: int) -> None:
@@ -336,7 +308,9 @@ class AgentService:
             return
         self._goals_told = states, now_ns
         self._bus.publish(
-            GOAL_STATES, GoalStates(agent=self._setup.id, stamp_ns=now_ns, states=states), agent=self._setup.id
+            topics.GOAL_STATES,
+            GoalStates(agent=self._setup.id, stamp_ns=now_ns, states=states),
+            agent=self._setup.id,
         )
         blocked = {each.name: each for each in states if each.state == "blocked"}
         for name, each in blocked.items():
@@ -379,7 +353,7 @@ class AgentService:
 
     # --- targets and obstacles ---------------------------------------------------------------------------------
 
-    def _on_pose(self, pose: TargetPose, now_ns: int) -> None:
+    def _on_pose(self, pose: planning.TargetPose, now_ns: int) -> None:
         """A tracker says where its target is."""
         if pose.target in self._detector.untracked:
             return
@@ -388,7 +362,7 @@ class AgentService:
             self._detector.set_truth(counts, now_ns)
             self._take_target_obstacles(counts, now_ns)
 
-    def _on_sighted(self, sighted: Sighted, now_ns: int) -> None:
+    def _on_sighted(self, sighted: planning.Sighted, now_ns: int) -> None:
         """A vehicle, of ours or of others, has seen a target."""
         pose = self._detector.note_sighting(sighted, now_ns)
         if pose is not None:
@@ -401,18 +375,18 @@ class AgentService:
         if seen:
             self.counters.count("targets_sighted", len(seen))
         for sighted in (*seen, *self._detector.retold(now_ns)):
-            self._bus.publish(SIGHTED, sighted, target=sighted.target, author=self._author)
+            self._bus.publish(topics.SIGHTED, sighted, target=sighted.target, author=self._author)
         for sighted in seen:
             self._on_sighted(sighted, now_ns)
 
-    def _take_target_obstacles(self, pose: TargetPose, now_ns: int) -> None:
+    def _take_target_obstacles(self, pose: planning.TargetPose, now_ns: int) -> None:
         for obstacle in () if self._parts.flies else self._parts.target_obstacles.obstacles_of(pose, now_ns):
             self.agent.obstacles.take_report(obstacle, now_ns)
 
     def _take_obstacles(self, now_ns: int) -> None:
         obstacles = self.agent.obstacles
         # Of each sender only the newest counts in a tick: however many a stranger sends, the work is bounded.
-        reports = sorted(self._collected(OBSTACLE, Obstacle), key=lambda each: each.seq)
+        reports = sorted(self._collected(topics.OBSTACLE, Obstacle), key=lambda each: each.seq)
         for obstacle in {(each.id, each.incarnation): each for each in reports}.values():
             obstacles.take_report(obstacle, now_ns)
             age_ns = now_ns - obstacle.stamp_ns
@@ -465,19 +439,21 @@ class AgentService:
             self._planners_changed = False
             alive = self._roster.alive("planner")
             chased = {vehicle.target for vehicle in self.agent.vehicles.values()}
-            known = chased.union(self._obedience.book.targets(self._setup.scenario))
+            known = chased.union(self._order_client.book.targets(self._setup.scenario))
             planners = {job_of(id): alive[id] for id in sorted(alive, reverse=True) if job_of(id) in known}
             places = self._roster.alive("places")
             if own := [id for id in sorted(places) if job_of(id) == self._places_job]:
                 planners[PLACES] = places[own[0]]
             self.agent.set_planners(planners, now_ns)
 
-    def _on_routes(self, replied: Replied, reply: RouteReply | PlaceRouteReply, now_ns: int) -> None:
+    def _on_routes(
+        self, replied: Replied, reply: planning.RouteReply | planning.PlaceRouteReply, now_ns: int
+    ) -> None:
         self.counters.observe("route_query_ms", replied.took_s * 1e3)
         self.counters.count("routes_received", len(reply.routes))
         self._publish_followed(self.agent.routes_given(_number(replied.tag), reply, now_ns))
 
-    def _on_costs(self, request: int, reply: CostReply) -> None:
+    def _on_costs(self, request: int, reply: planning.CostReply) -> None:
         costs_s = column(reply.cost_to_go_s, "<f4")
         if reply.target_cell is not None or np.isfinite(costs_s).any():  # never seen, and searched for
             self.agent.assignment.costs_given(request, reply.target, costs_s)
@@ -485,7 +461,7 @@ class AgentService:
     def _on_costs_ended(self, request: int, now_ns: int) -> None:
         costs = self.agent.costs_ended(request, now_ns)
         if costs is not None:
-            self._bus.publish(SHARED_COSTS, costs, group=costs.group, author=costs.author)
+            self._bus.publish(topics.SHARED_COSTS, costs, group=costs.group, author=costs.author)
 
     def _perform(self, actions: list[AgentAction]) -> None:
         """Asks planners what the core wants to know."""
@@ -500,15 +476,17 @@ class AgentService:
                         "vehicle_class": self._class,
                     }
                     if goal is not None:
-                        place, job = PlaceRouteRequest(to=goal, **from_here), self._places_job
-                        self._member.ask_by_name(PLACE_ROUTE, place, tag=tag, timeout_s=timeout_s, places=job)
+                        place, job = planning.PlaceRouteRequest(to=goal, **from_here), self._places_job
+                        self._member.ask_by_name(
+                            topics.PLACE_ROUTE, place, tag=tag, timeout_s=timeout_s, places=job
+                        )
                         continue
                     self.counters.count("reroute_requests", reroutes)
-                    asking = RouteRequest(force=force, **from_here)
-                    self._member.ask_by_name(ROUTE, asking, tag=tag, timeout_s=timeout_s, target=target)
+                    asking = planning.RouteRequest(force=force, **from_here)
+                    self._member.ask_by_name(topics.ROUTE, asking, tag=tag, timeout_s=timeout_s, target=target)
                 case AskCosts(request, _, cells):
-                    costs = CostRequest(cells=list(cells), vehicle_class=self._class)
-                    self._member.ask_by_name(COST, costs, tag=f"{_COSTS}{request}", timeout_s=self._answer_s)
+                    costs = planning.CostRequest(cells=list(cells), vehicle_class=self._class)
+                    self._member.ask_by_name(topics.COST, costs, tag=f"{_COSTS}{request}", timeout_s=self._answer_s)
 
     def _publish_followed(self, begun: Sequence[Followed]) -> None:
         for route in begun:
@@ -526,7 +504,7 @@ class AgentService:
                 if vehicle.goal is None:
                     self.counters.count_by(UNPROVEN_TO, route.target)
                 self.counters.count_by(UNPROVEN_OF, route.vehicle)
-            self._bus.publish(FOLLOWED, route, agent=self._setup.id, vehicle=route.vehicle)
+            self._bus.publish(topics.FOLLOWED, route, agent=self._setup.id, vehicle=route.vehicle)
 
 
 def _number(tag: str) -> int:

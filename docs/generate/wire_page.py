@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import inspect
 import json
+import re
 import textwrap
 import types
 import typing
@@ -16,7 +17,7 @@ from docs.generate.templates import filled
 from launch_scripts.process_table import ROLES as STARTED_ROLES
 from swarm import grid
 from swarm.bus import bus
-from swarm.wire import codec
+from swarm.wire import codec, topics
 from swarm.wire.access import MEMBERS, OPERATOR, ROLES, Grant
 from swarm.wire.fields import Characters, Column, taken_apart
 from swarm.wire.messages import WIRE_VERSION, Message
@@ -38,8 +39,15 @@ def document() -> str:
     return filled(
         "wire", topics=TOPICS, messages=messages(), enums=(MarkKind, VehicleState, RouteStatus),
         version=WIRE_VERSION, alive_key=ALIVE_KEY, operator=OPERATOR, bus=bus, codec=codec, grid=grid, how=_how,
-        link=_link, granted=_granted, schemas=_schemas, struct=_struct, parts=parts,
+        link=_link, granted=_granted, schemas=_schemas, struct=_struct, parts=parts, told=_told(),
     )  # fmt: skip
+
+
+def _told() -> dict[str, list[str]]:
+    """Name of a topic -> what it is and its rate, by the docstring below it."""
+    below = re.compile(r'^(\w+) = (?:Topic|replace)\(.*?^"""(.+?)\n\nRate: (.+?)\n"""', re.DOTALL | re.MULTILINE)
+    found = below.findall(inspect.getsource(topics))
+    return {getattr(topics, name).name: [" ".join(text.split()) for text in texts] for name, *texts in found}
 
 
 def json_document() -> str:

@@ -10,16 +10,7 @@ from typing import Annotated, Any
 
 import typer
 
-from launch_scripts.commands.shared_options import (
-    HIGHEST_PORT,
-    AsJson,
-    Crs,
-    Force,
-    PresetOption,
-    SignalsAddress,
-    VehicleClass,
-    Where,
-)
+from launch_scripts.commands import shared_options
 from launch_scripts.typer_commands import ASK, command
 from swarm.errors import ConfigError
 
@@ -31,17 +22,17 @@ CPU without any query."""
 
 @command(app, ASK)
 def route(
-    where: Where,
+    where: shared_options.Where,
     target: str | None = None,
     terrain: str | None = None,
     start: Annotated[str | None, typer.Option("--from", metavar="PLACE")] = None,
     end: Annotated[str | None, typer.Option("--to", metavar="PLACE")] = None,
-    vehicle_class: VehicleClass = "ground",
+    vehicle_class: shared_options.VehicleClass = "ground",
     out: Path | None = None,
-    preset: PresetOption = None,
-    crs: Crs = None,
-    force: Force = False,
-    as_json: AsJson = False,
+    preset: shared_options.PresetOption = None,
+    crs: shared_options.Crs = None,
+    force: shared_options.Force = False,
+    as_json: shared_options.AsJson = False,
 ) -> None:
     """Find the cheapest route to a target or a place of a running swarm, or on a terrain file.
 
@@ -98,7 +89,7 @@ def route(
 
 
 @command(app, ASK)
-def status(where: Where, watch: bool = False, as_json: AsJson = False) -> None:
+def status(where: shared_options.Where, watch: bool = False, as_json: shared_options.AsJson = False) -> None:
     """Show a running swarm: metrics, processes, targets and alarms.
 
     Without --connect it asks the newest active run of this machine, whatever its ports.
@@ -122,7 +113,10 @@ def status(where: Where, watch: bool = False, as_json: AsJson = False) -> None:
 
 @command(app, ASK)
 def top(
-    where: Where, each: bool = False, once: bool = False, as_json: Annotated[bool, typer.Option("--json")] = False
+    where: shared_options.Where,
+    each: bool = False,
+    once: bool = False,
+    as_json: Annotated[bool, typer.Option("--json")] = False,
 ) -> None:
     """Watch a running swarm, once a second; Ctrl-C ends it.
 
@@ -143,7 +137,7 @@ def top(
 
 
 @command(app, ASK)
-def health(url: Annotated[str, typer.Option()], live: bool = False, as_json: AsJson = False) -> int:
+def health(url: Annotated[str, typer.Option()], live: bool = False, as_json: shared_options.AsJson = False) -> int:
     """Check if the processes of a machine are ready: exit code 0 if they are, 1 if not, 4 without a reply.
 
     It needs no router. `swarm status` shows the whole swarm.
@@ -162,9 +156,9 @@ def health(url: Annotated[str, typer.Option()], live: bool = False, as_json: AsJ
 
 @command(app, ASK)
 def metrics(
-    where: Where,
-    port: Annotated[int, typer.Option(min=0, max=HIGHEST_PORT)] = 9464,
-    signals_address: SignalsAddress = "127.0.0.1",
+    where: shared_options.Where,
+    port: Annotated[int, typer.Option(min=0, max=shared_options.HIGHEST_PORT)] = 9464,
+    signals_address: shared_options.SignalsAddress = "127.0.0.1",
     dashboard: bool = False,
     alerts: bool = False,
 ) -> None:

@@ -16,20 +16,10 @@ from rich.text import Text
 
 from launch_scripts.check.scenario_check import check_start
 from launch_scripts.commands.shared_options import AsJson, Force, Namespace, ScenarioArgument, Tls
-from launch_scripts.deploy import certificates
+from launch_scripts.deploy import certificates, machines_needed
 from launch_scripts.deploy.hosts import load_hosts
 from launch_scripts.deploy.kits import CERTIFICATES, keepers_before, write_kits
 from launch_scripts.deploy.machine_plan import Plan, make_plan, plan_fields
-from launch_scripts.deploy.machines_needed import (
-    LEAST_SIDE,
-    Estimate,
-    Machine,
-    Swarm,
-    fewest_machines,
-    reaches,
-    side_of,
-    too_much,
-)
 from launch_scripts.deploy.service_files import compose_files, systemd_files, zenohd_config
 from launch_scripts.launcher.run_options import common_run_id, find_scenario, own_certificate, with_network
 from launch_scripts.launcher.terminal_tables import columns
@@ -179,15 +169,15 @@ def size(
     link       Link of a machine, Mbit/s.
     as_json    Print one JSON object instead of tables.
     """
-    least = max(LEAST_SIDE**2, 4 * vehicles)
+    least = max(machines_needed.LEAST_SIDE**2, 4 * vehicles)
     if cells is not None and not least <= cells <= _MOST_SIDE**2:
         raise ConfigError(f"--map is {cells}, expected {least} to {_MOST_SIDE**2} cells for {vehicles} vehicles")
-    side, agents = side_of(vehicles, cells), -(-vehicles // per_agent)
-    swarm = Swarm(vehicles=vehicles, targets=targets, agents=agents, side=side, tick_hz=tick_hz)
-    machine = Machine(cores, memory, link)
-    found = fewest_machines(Estimate(swarm, standbys), machine)
-    full = too_much(found, machine)
-    beyond = found.machines > 1 or not reaches(swarm)
+    side, agents = machines_needed.side_of(vehicles, cells), -(-vehicles // per_agent)
+    swarm = machines_needed.Swarm(vehicles=vehicles, targets=targets, agents=agents, side=side, tick_hz=tick_hz)
+    machine = machines_needed.Machine(cores, memory, link)
+    found = machines_needed.fewest_machines(machines_needed.Estimate(swarm, standbys), machine)
+    full = machines_needed.too_much(found, machine)
+    beyond = found.machines > 1 or not machines_needed.reaches(swarm)
     if as_json:
         typer.echo(json.dumps({**msgspec.to_builtins(found), "full": full, "extrapolated": beyond}))
     else:

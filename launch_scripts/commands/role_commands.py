@@ -12,15 +12,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 import msgspec
 import typer
 
-from launch_scripts.commands.shared_options import (
-    HIGHEST_PORT,
-    LogFormatOption,
-    Namespace,
-    Rank,
-    Runs,
-    SignalsAddress,
-    Tls,
-)
+from launch_scripts.commands import shared_options
 from launch_scripts.typer_commands import ADMIN, command, complete_scenarios
 from swarm.errors import ConfigError
 from swarm.liveness import ranked_id
@@ -33,7 +25,7 @@ app = typer.Typer()
 
 
 @dataclass(frozen=True)
-class Part(Tls):
+class Part(shared_options.Tls):
     """Locations of a process's scenario, router and files.
 
     connect      The router's endpoint, such as tls/HOST:7447; by default that of the run.
@@ -51,11 +43,11 @@ class Part(Tls):
         ),
     ] = "jacksboro"
     connect: str | None = None
-    namespace: Namespace = None
-    runs: Runs = Path("runs")
-    health_port: Annotated[int | None, typer.Option(min=0, max=HIGHEST_PORT)] = None
-    signals_address: SignalsAddress = "127.0.0.1"
-    log_format: LogFormatOption = "text"
+    namespace: shared_options.Namespace = None
+    runs: shared_options.Runs = Path("runs")
+    health_port: Annotated[int | None, typer.Option(min=0, max=shared_options.HIGHEST_PORT)] = None
+    signals_address: shared_options.SignalsAddress = "127.0.0.1"
+    log_format: shared_options.LogFormatOption = "text"
     run_id: str | None = None
 
 
@@ -76,7 +68,7 @@ class Own:
     id: str = "0"
     target: str | None = None
     group: str | None = None
-    rank: Rank = 0
+    rank: shared_options.Rank = 0
     listen: str | None = None
     store_path: Annotated[Path | None, typer.Option("--store")] = None
     rebuild: bool = False

@@ -15,18 +15,7 @@ import typer
 from numpy.typing import NDArray
 
 from launch_scripts.observe.palette import said_length
-from launch_scripts.report.gis_formats import (
-    COSTS,
-    MISSIONS,
-    Feature,
-    FieldKind,
-    Layer,
-    areas_of,
-    turns_of,
-    write_layers,
-    write_mission,
-    write_raster,
-)
+from launch_scripts.report import gis_formats
 from planner_service.route_finder import RouteFinder
 from shared_map.array_files import Floats
 from shared_map.terrain.map_frame import MapFrame, middles_of
@@ -108,7 +97,7 @@ def metres_along(grid: GridSpec, cells: NDArray[np.int64], diagonal: float = np.
     return np.concatenate(([0.0], np.cumsum(steps)))
 
 
-def layers_of(route: DescribedRoute, ending: str) -> list[Layer]:
+def layers_of(route: DescribedRoute, ending: str) -> list[gis_formats.Layer]:
     """The route as a line; in a table its cells instead, and in a GeoPackage these, too."""
     x_m, y_m = route.metres()
     steps: dict[str, NDArray[Any]] = {"at_m": route.at_m.round(2)}
@@ -117,15 +106,17 @@ def layers_of(route: DescribedRoute, ending: str) -> list[Layer]:
     xy_m = np.stack([x_m, y_m], axis=1)
     if route.height_m is not None and np.isfinite(route.height_m).all():
         xy_m = np.column_stack([xy_m, route.height_m.round(2)])
-    kinds: dict[type, FieldKind] = {str: "text", int: "int", float: "real", dict: "json", list: "json"}
+    kinds: dict[type, gis_formats.FieldKind] = {str: "text", int: "int", float: "real", dict: "json", list: "json"}
     values = {"name": route.name, **route.facts(), "rule": route.rule, "resolution_m": route.grid.resolution_m}
     if ending == ".geojson":
         values |= {name: each.tolist() for name, each in steps.items()}
     # A line has two points at least, even for a vehicle that is already there.
     time_ns = None if route.at_s is None or len(xy_m) < 2 else (route.at_s * 1e9).round().astype(np.int64)
     timed = time_ns if ending == ".gpx" else None  # from 1970 on: when it will be driven is not known
-    whole = Feature([xy_m if len(xy_m) > 1 else xy_m[[0, 0]]], values, timed)
-    line = Layer("route", "LineString", {name: kinds[type(v)] for name, v in values.items()}, [whole], COSTS)
+    whole = gis_formats.Feature([xy_m if len(xy_m) > 1 else xy_m[[0, 0]]], values, timed)
+    line = gis_formats.Layer(
+        "route", "LineString", {name: kinds[type(v)] for name, v in values.items()}, [whole], gis_formats.COSTS
+    )
     if ending not in (".csv", ".gpkg"):
         return [line]
     rows, cols = np.divmod(route.cells, route.grid.cols)
@@ -134,15 +125,15 @@ def layers_of(route: DescribedRoute, ending: str) -> list[Layer]:
         columns["height_m"] = route.height_m.round(2)
     columns |= steps
     told = zip(*(column.tolist() for column in columns.values()), strict=True)
-    cells = Layer(
+    cells = gis_formats.Layer(
         "route_cells",
         "Point",
         {name: "int" if name in ("row", "col") else "real" for name in columns},
         [
-            Feature([place], dict(zip(columns, each, strict=True)))
+            gis_formats.Feature([place], dict(zip(columns, each, strict=True)))
             for place, each in zip(xy_m[:, None, :2], told, strict=True)
         ],
-        COSTS,
+        gis_formats.COSTS,
     )
     return [cells] if ending == ".csv" else [line, cells]
 
@@ -151,14 +142,16 @@ def write_route(route: DescribedRoute, path: Path) -> None:
     """Writes a route in the format of the file's ending. Raises ConfigError or StoreError in one sentence, also
     without a place on Earth or a terrain where the format needs one."""
     ending = path.suffix.lower()
-    if ending in MISSIONS:
+    if ending in gis_formats.MISSIONS:
         if route.grid.crs == "local":
             raise ConfigError(f"--out {path}: the terrain has no place on Earth; write .csv, .geojson or .gpkg")
-        x_m, y_m = middles_of(route.grid, turns_of(route.cells, route.grid))
-        write_mission(path, [(lat, lon) for lat, lon in MapFrame(route.grid).to_degrees(x_m, y_m).T.tolist()])
+        x_m, y_m = middles_of(route.grid, gis_formats.turns_of(route.cells, route.grid))
+        gis_formats.write_mission(
+            path, [(lat, lon) for lat, lon in MapFrame(route.grid).to_degrees(x_m, y_m).T.tolist()]
+        )
         return
     if ending != ".png":
-        write_layers(path, layers_of(route, ending), MapFrame(route.grid))
+        gis_formats.write_layers(path, layers_of(route, ending), MapFrame(route.grid))
         return
     if route.terrain is None or route.height_m is None:
         raise ConfigError(
@@ -390,8 +383,8 @@ def write_reach(found: Reach, path: Path, every_s: float | None, slack: float) -
     """
     if path.suffix.lower() in (".tif", ".tiff"):
         seconds = np.where(np.isfinite(found.seconds), found.seconds, np.float32(-1))
-        told, tags = ["seconds of travel, -1 no way"], {"TIFFTAG_IMAGEDESCRIPTION": COSTS}
-        write_raster(path, [seconds], found.grid, descriptions=told, unit="s", tags=tags, nodata=-1.0)
+        told, tags = ["seconds of travel, -1 no way"], {"TIFFTAG_IMAGEDESCRIPTION": gis_formats.COSTS}
+        gis_formats.write_raster(path, [seconds], found.grid, descriptions=told, unit="s", tags=tags, nodata=-1.0)
         return
     if every_s is None:
         every_s = _BAND_S if found.fastest_s is None else max(found.fastest_s * slack / _SLACK_BANDS, 1e-3)
@@ -403,8 +396,8 @@ def write_reach(found: Reach, path: Path, every_s: float | None, slack: float) -
     above_s = np.where(known, found.seconds - np.float32(found.fastest_s or 0.0), 0)
     bands: NDArray[np.int32] = np.maximum(np.floor(above_s / every_s), 0).astype(np.int32)
     areas = [
-        Feature(rings, {"from_s": band * every_s, "to_s": (band + 1) * every_s})
-        for band, rings in areas_of(bands, known, found.grid)
+        gis_formats.Feature(rings, {"from_s": band * every_s, "to_s": (band + 1) * every_s})
+        for band, rings in gis_formats.areas_of(bands, known, found.grid)
     ]
-    layer = Layer("reach", "Polygon", {"from_s": "real", "to_s": "real"}, areas, COSTS)
-    write_layers(path, [layer], MapFrame(found.grid))
+    layer = gis_formats.Layer("reach", "Polygon", {"from_s": "real", "to_s": "real"}, areas, gis_formats.COSTS)
+    gis_formats.write_layers(path, [layer], MapFrame(found.grid))

@@ -10,19 +10,7 @@ from typing import Annotated, ClassVar
 import msgspec
 import typer
 
-from launch_scripts.commands.shared_options import (
-    HIGHEST_PORT,
-    AsJson,
-    LogFormatOption,
-    Namespace,
-    PortOption,
-    Runs,
-    ScenarioArgument,
-    Seconds,
-    Seed,
-    SignalsAddress,
-    Tls,
-)
+from launch_scripts.commands import shared_options
 from launch_scripts.typer_commands import NETWORK, PART, RUN, command
 from swarm.liveness import HIGHEST_RANK
 
@@ -44,22 +32,22 @@ class RunOptions:
     """
 
     panel: ClassVar[str | None] = None
-    seconds: Seconds = None
-    seed: Seed = None
-    runs: Runs = Path("runs")
-    port: PortOption = None
+    seconds: shared_options.Seconds = None
+    seed: shared_options.Seed = None
+    runs: shared_options.Runs = Path("runs")
+    port: shared_options.PortOption = None
     no_live: bool = False
     record_inputs: bool = False
-    metrics_port: Annotated[int | None, typer.Option(min=0, max=HIGHEST_PORT)] = None
-    signals_address: SignalsAddress = "127.0.0.1"
-    log_format: LogFormatOption = "text"
+    metrics_port: Annotated[int | None, typer.Option(min=0, max=shared_options.HIGHEST_PORT)] = None
+    signals_address: shared_options.SignalsAddress = "127.0.0.1"
+    log_format: shared_options.LogFormatOption = "text"
     plain: bool = False
     detach: Annotated[bool, typer.Option("--detach", "-d")] = False
-    as_json: AsJson = False
+    as_json: shared_options.AsJson = False
 
 
 @dataclass(frozen=True)
-class Meeting(Tls):
+class Meeting(shared_options.Tls):
     """Endpoints where the processes of a launcher meet others.
 
     connect  Join a router that runs elsewhere, such as tcp/127.0.0.1:7447; start none here.
@@ -69,7 +57,7 @@ class Meeting(Tls):
     panel: ClassVar[str | None] = NETWORK
     connect: str | None = None
     listen: str | None = None
-    namespace: Namespace = None
+    namespace: shared_options.Namespace = None
 
 
 @dataclass(frozen=True)
@@ -107,7 +95,7 @@ def demo(run: RunOptions) -> int:
 
 
 @command(app, RUN)
-def up(scenario: ScenarioArgument, run: RunOptions, meeting: Meeting, part: SomeProcesses) -> int:
+def up(scenario: shared_options.ScenarioArgument, run: RunOptions, meeting: Meeting, part: SomeProcesses) -> int:
     """Run a scenario: all of its processes on this machine, or some.
 
     swarm up jacksboro --seconds 20 --port 0

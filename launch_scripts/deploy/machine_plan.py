@@ -14,17 +14,9 @@ from typing import Any
 
 import msgspec
 
+from launch_scripts import process_table
 from launch_scripts.deploy.hosts import HostConfig, HostName, HostsConfig
 from launch_scripts.deploy.machines_needed import one_process, swarm_of
-from launch_scripts.process_table import (
-    LAUNCHER,
-    RECORDED_BESIDE,
-    ROLES,
-    TABLE,
-    certificate_name,
-    certificate_names,
-    processes_of,
-)
 from swarm.config.agent_plan import plan_agents
 from swarm.config.scenario import Scenario, StandbyConfig
 from swarm.errors import ConfigError
@@ -110,7 +102,7 @@ class Plan(msgspec.Struct, frozen=True, kw_only=True):
     @property
     def records(self) -> str:
         """Name of the machine whose launcher records and reports the run, where launchers start the processes."""
-        return next(host.name for host, process in self.processes if process.name == RECORDED_BESIDE)
+        return next(host.name for host, process in self.processes if process.name == process_table.RECORDED_BESIDE)
 
     @property
     def processes(self) -> list[tuple[PlannedHost, PlannedProcess]]:
@@ -132,12 +124,14 @@ def make_plan(
     scenario = msgspec.structs.replace(scenario, standbys=StandbyConfig(**more))
     _check(scenario, hosts)
     cores = cores_of(scenario)
-    placed = place(_processes(scenario, hosts, cores), hosts.hosts, keepers, cores[LAUNCHER])
+    placed = place(_processes(scenario, hosts, cores), hosts.hosts, keepers, cores[process_table.LAUNCHER])
     routers = [host for host in hosts.hosts if ROUTER in host.roles]
     planned = tuple(_host(hosts.port, host, placed[host.name], routers) for host in hosts.hosts)
     # Routers admit what the scenario does not name itself, too: all keepers, routers and launchers.
     beside = (each.certificate for host in planned for each in (*host.of(ROUTER), *host.of(KEEPER)))
-    admit = dict.fromkeys((*certificate_names(scenario), *beside, *(host.operator for host in planned)))
+    admit = dict.fromkeys(
+        (*process_table.certificate_names(scenario), *beside, *(host.operator for host in planned))
+    )
     network = msgspec.structs.replace(scenario.network, admit=tuple(admit))
     scenario = msgspec.structs.replace(scenario, network=network)
     return Plan(run_id=run_id, scenario=scenario, port=hosts.port, survive=hosts.losses, hosts=planned)
@@ -155,8 +149,8 @@ def _check(scenario: Scenario, hosts: HostsConfig) -> None:
         "places": (standbys.planner + 1, f"{standbys.planner} standbys of each planner of places"),
         "targets": (standbys.targets + 1, f"{standbys.targets} standbys of the targets process"),
     }
-    for role in ROLES:
-        if TABLE[role].expendable or not TABLE[role].jobs(scenario):
+    for role in process_table.ROLES:
+        if process_table.TABLE[role].expendable or not process_table.TABLE[role].jobs(scenario):
             continue
         found = sum(role in host.roles for host in hosts.hosts)
         wanted, why = (1, "") if alone else apart.get(role, (1, ""))
@@ -183,13 +177,13 @@ def _processes(scenario: Scenario, hosts: HostsConfig, cores: Mapping[str, float
         KEEPER: range(hosts.losses + 1),
     }
     named = [(role, str(n)) for role, numbers in ids.items() for n in numbers]
-    named += [(spec.role, spec.id) for spec in processes_of(scenario, tuple(carried - ids.keys()))]
+    named += [(spec.role, spec.id) for spec in process_table.processes_of(scenario, tuple(carried - ids.keys()))]
     of_mean = len(vehicles) / max(sum(vehicles.values()), 1)
     return [
         PlannedProcess(
             role=role,
             id=id,
-            certificate=certificate_name(scenario, role, id),
+            certificate=process_table.certificate_name(scenario, role, id),
             job=KEEPER if role == KEEPER else f"{role}.{job_of(id)}",
             cores=cores[role] * (vehicles[id] * of_mean if role == AGENT else 1),
         )
@@ -213,7 +207,7 @@ def place(
     launcher_cores  that the launcher of each machine takes
     """
     placed: dict[str, list[PlannedProcess]] = {host.name: [] for host in hosts}
-    carrying = {role: [host for host in hosts if role in host.roles] for role in ROLES}
+    carrying = {role: [host for host in hosts if role in host.roles] for role in process_table.ROLES}
 
     def load(host: HostConfig) -> float:
         return launcher_cores + sum(each.cores for each in placed[host.name])
@@ -230,7 +224,7 @@ def place(
     def stays(process: PlannedProcess) -> bool:
         return process.role == KEEPER and before.get(process.id) in [host.name for host in carrying[KEEPER]]
 
-    by_role = {role: [each for each in processes if each.role == role] for role in ROLES}
+    by_role = {role: [each for each in processes if each.role == role] for role in process_table.ROLES}
     for host, router in zip(carrying[ROUTER], by_role.pop(ROUTER), strict=True):
         placed[host.name].append(router)
     for role in sorted(by_role, key=lambda role: (len(carrying[role]), role != AGENT)):
@@ -270,7 +264,7 @@ def _host(port: int, host: HostConfig, processes: list[PlannedProcess], routers:
         name=host.name,
         address=host.address,
         cores=host.cores,
-        processes=tuple(sorted(processes, key=lambda each: ROLES.index(each.role))),
+        processes=tuple(sorted(processes, key=lambda each: process_table.ROLES.index(each.role))),
         listen=listen if has_router else (),
         connect=(*(own if has_router else ()), *others),
         peers=tuple(others[: routers.index(host)]) if has_router else (),

@@ -14,18 +14,10 @@ from pathlib import Path
 
 import msgspec
 
+from launch_scripts import process_table
 from launch_scripts.launcher.log_file import LogFormat
 from launch_scripts.observe.run_folder import LAST
 from launch_scripts.ports import free_ports
-from launch_scripts.process_table import (
-    RECORDED_BESIDE,
-    ROLES,
-    TABLE,
-    ProcessSpec,
-    certificate_name,
-    check_name,
-    processes_of,
-)
 from launch_scripts.web import LOOPBACK
 from shared_map.importers.terrain_sources import FILE_KINDS, is_terrain
 from swarm.config.cost_rules import cost_of_preset
@@ -135,7 +127,7 @@ def tls_of(ca: str | None, certificate: str | None, key: str | None, folder: str
 def as_process(scenario: Scenario, role: str, id: str) -> Scenario:
     """The scenario as one process needs it: with its own certificate, where `network.tls` names a folder of them.
     Raises ConfigError where the folder has none for it."""
-    tls = own_certificate(scenario.network.tls, certificate_name(scenario, role, id))
+    tls = own_certificate(scenario.network.tls, process_table.certificate_name(scenario, role, id))
     return msgspec.structs.replace(scenario, network=msgspec.structs.replace(scenario.network, tls=tls))
 
 
@@ -188,7 +180,7 @@ def make_run_dir(runs: Path, run_id: str) -> Path:
     """Returns the folder of a run on this machine: files of the run, such as a keeper's store, are found there when
     its processes restart. Raises ConfigError on an id that no folder may have, StoreError where the folder cannot
     be made."""
-    check_name("run id", run_id)
+    process_table.check_name("run id", run_id)
     if run_id in (".", "..", LAST):
         raise ConfigError(f"run id {run_id!r} means another folder of {runs}; choose another")
     run_dir = runs / run_id
@@ -250,7 +242,7 @@ class UpOptions:
 
     scenario: Scenario
     runs: Path
-    table: tuple[ProcessSpec, ...]
+    table: tuple[process_table.ProcessSpec, ...]
     joins: bool = False
     run_id: str | None = None
     as_json: bool = False
@@ -276,12 +268,12 @@ class UpOptions:
     @property
     def is_whole(self) -> bool:
         """True if only a router may be missing."""
-        return set(processes_of(self.scenario, ROLES[1:])) <= set(self.table)
+        return set(process_table.processes_of(self.scenario, process_table.ROLES[1:])) <= set(self.table)
 
     @property
     def records(self) -> bool:
         """True if this launcher is the one of the run that records and reports it."""
-        return any(spec.name == RECORDED_BESIDE for spec in self.table)
+        return any(spec.name == process_table.RECORDED_BESIDE for spec in self.table)
 
     @property
     def asks_for_ground(self) -> bool:
@@ -298,29 +290,29 @@ class UpOptions:
 
 def chosen_processes(
     scenario: Scenario, words: Sequence[str], rank: int | None, *, joins: bool = False
-) -> tuple[ProcessSpec, ...]:
+) -> tuple[process_table.ProcessSpec, ...]:
     """The processes that `--only` names, in order of start: of a role, or `ROLE.ID` alone. Routers and keepers may
     have any id, as there may be more of them than in the scenario. Raises ConfigError where there is none.
 
     rank   of planners and the targets process, only those of this rank; if None all
     joins  there is a router elsewhere: none is among them
     """
-    chosen: dict[str, ProcessSpec] = {}
+    chosen: dict[str, process_table.ProcessSpec] = {}
     for word in words:
         role, _, id = word.partition(".")
-        if role not in ROLES:
-            raise ConfigError(f"--only: no role {role!r}{choice(role, ROLES, ' the roles are ')}")
+        if role not in process_table.ROLES:
+            raise ConfigError(f"--only: no role {role!r}{choice(role, process_table.ROLES, ' the roles are ')}")
         if joins and role == "router":
             continue
-        every = processes_of(scenario, (role,), rank)
+        every = process_table.processes_of(scenario, (role,), rank)
         if id:
-            ids = [spec.id for spec in processes_of(scenario, (role,))]
-            if id not in ids and not TABLE[role].any_id:
+            ids = [spec.id for spec in process_table.processes_of(scenario, (role,))]
+            if id not in ids and not process_table.TABLE[role].any_id:
                 raise ConfigError(f"--only: no {role} {id!r} in scenario {scenario.name}; it has {', '.join(ids)}")
-            check_name("--only", id)
-            every = [ProcessSpec(role, id)]
+            process_table.check_name("--only", id)
+            every = [process_table.ProcessSpec(role, id)]
         chosen |= {spec.name: spec for spec in every}
     if not chosen:
         of_rank = "" if rank is None else f" of rank {rank}"
         raise ConfigError(f"scenario {scenario.name} has no {' or '.join(words)}{of_rank} to start; see standbys")
-    return tuple(sorted(chosen.values(), key=lambda spec: ROLES.index(spec.role)))
+    return tuple(sorted(chosen.values(), key=lambda spec: process_table.ROLES.index(spec.role)))

@@ -14,20 +14,13 @@ from typing import Any
 
 from launch_scripts.check.machine_check import this_machine, why_no_room
 from launch_scripts.check.scenario_check import check_places, check_start
+from launch_scripts.launcher import run_options
 from launch_scripts.launcher.console import Terminal, tunnel, what_is_left
 from launch_scripts.launcher.fetched_terrain import fetch_if_missing, find_members, missing_files
 from launch_scripts.launcher.forkserver import ROLES_AND_KERNELS, ROLES_ONLY, WarmUp
 from launch_scripts.launcher.local_processes import Ending, LocalSwarm
 from launch_scripts.launcher.log_file import JsonLines, Speaker, log_to
 from launch_scripts.launcher.ordered_planners import OrderedPlanners, with_target
-from launch_scripts.launcher.run_options import (
-    UpOptions,
-    as_process,
-    common_run_id,
-    make_run_dir,
-    new_run_id,
-    next_incarnation,
-)
 from launch_scripts.launcher.signals import MachineSignals, StopAsked
 from launch_scripts.launcher.takeover import TakeOver
 from launch_scripts.launcher.terminal_tables import live_table, plain_line
@@ -74,16 +67,16 @@ _ELSEWHERE = f"the run is recorded and reported by the launcher that starts {REC
 """Said by all others."""
 
 
-def run_swarm(options: UpOptions) -> int:
+def run_swarm(options: run_options.UpOptions) -> int:
     """Runs to the end. The exit code is 0 only if every process ended as it was asked to. Raises SwarmError."""
     check_start(options.scenario, joins=options.joins, has_ground=not options.asks_for_ground)
     for spec in options.table:
-        as_process(options.scenario, spec.role, spec.id)  # raises where its certificate is missing
+        run_options.as_process(options.scenario, spec.role, spec.id)  # raises where its certificate is missing
     check_plugins(options.scenario, options.roles)
     if not options.joins and not options.takes_over:
         check_ports(options.scenario, options.roles, (options.signals_address, options.metrics_port or 0))
     run_id, started_ns = _run_id_of(options)
-    run_dir = make_run_dir(options.runs, run_id)
+    run_dir = run_options.make_run_dir(options.runs, run_id)
     log_to(run_dir / LAUNCHER_LOG, options.log_format, Speaker(LAUNCHER, "0", run_id))
     log.info("began %.2f s ago", time.monotonic() - options.began_s)
     run = None
@@ -95,27 +88,29 @@ def run_swarm(options: UpOptions) -> int:
             shutil.rmtree(run_dir, ignore_errors=True)
 
 
-def _run_id_of(options: UpOptions) -> tuple[str, int | None]:
+def _run_id_of(options: run_options.UpOptions) -> tuple[str, int | None]:
     """A whole swarm is a new run. A part of one belongs to the run that it finds, or to that of its scenario. With
     the id comes when the run began, if it runs already."""
     found: list[RunInfo] = []
     if options.joins or options.takes_over:
         log_to(None, options.log_format)  # it may have to wait, and says so
-        found = [info for info in find_members(as_process(options.scenario, LAUNCHER, "0")) if info.run_id]
+        found = [
+            info for info in find_members(run_options.as_process(options.scenario, LAUNCHER, "0")) if info.run_id
+        ]
     run_id = options.run_id
     if run_id is None and options.is_whole and not options.takes_over:
-        run_id = new_run_id()
+        run_id = run_options.new_run_id()
     elif run_id is None:
-        run_id = found[0].run_id if found else common_run_id(options.scenario)
+        run_id = found[0].run_id if found else run_options.common_run_id(options.scenario)
     return run_id, plan_of_members(info for info in found if info.run_id == run_id).started_ns
 
 
 class _Run:
     """A run in progress; all of it happens on the main thread."""
 
-    def __init__(self, options: UpOptions, run_id: str, run_dir: Path, started_ns: int | None) -> None:
+    def __init__(self, options: run_options.UpOptions, run_id: str, run_dir: Path, started_ns: int | None) -> None:
         self._options = options
-        self._scenario = as_process(options.scenario, LAUNCHER, "0")
+        self._scenario = run_options.as_process(options.scenario, LAUNCHER, "0")
         self._run_dir = run_dir
         self._run_id = run_id
         self._joined_ns = started_ns
@@ -261,10 +256,10 @@ class _Run:
         self._preparing = f"preparing the terrain: {what}, {share:.0%}"
 
     def _setup_of(self, spec: ProcessSpec) -> RoleSetup:
-        scenario = as_process(self._options.scenario, spec.role, spec.id)
+        scenario = run_options.as_process(self._options.scenario, spec.role, spec.id)
         if spec.role == "planner":
             scenario = with_target(scenario, self._book, job_of(spec.id))
-        incarnation = next_incarnation(self._run_dir, spec.role, spec.id)
+        incarnation = run_options.next_incarnation(self._run_dir, spec.role, spec.id)
         if self._known is not None and self._take_over is None:  # else those before are its own, too
             self._known.observed.started(Peer(spec.role, spec.id, incarnation))
         return RoleSetup(

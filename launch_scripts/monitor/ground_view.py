@@ -16,26 +16,7 @@ import numpy as np
 import rerun as rr
 from numpy.typing import NDArray
 
-from launch_scripts.monitor.ground_colours import (
-    COST_COLOURS,
-    COST_TO_GO_COLOURS,
-    LEARNED_COLOURS,
-    TREE,
-    CostSamples,
-    GroundColours,
-    TargetPictures,
-)
-from launch_scripts.monitor.live_layout import (
-    COST,
-    KNOWN,
-    LEARNED,
-    NEAREST,
-    PHOTO,
-    ZONE_COLOURS,
-    Layer,
-    Scale,
-    legend_picture,
-)
+from launch_scripts.monitor import ground_colours, live_layout
 from launch_scripts.monitor.rerun_outputs import Pen, RateLimit, even, ragged, shown
 from launch_scripts.monitor.styles import Look
 from launch_scripts.monitor.terrain_mesh import Bytes, Floats, MeshTile, TerrainMesh
@@ -106,7 +87,7 @@ class Scene:
     """
 
     pen: Pen
-    layers: Sequence[Layer] = (PHOTO,)
+    layers: Sequence[live_layout.Layer] = (live_layout.PHOTO,)
     truth: Floats | None = None
     zones: Sequence[Area] = ()
 
@@ -132,23 +113,23 @@ class GroundView:
         """Zones of the scenario, and all that stand."""
         self._target_ids, self._classes = scenario.target_ids, list(class_numbers(scenario))
         now, prior = cost_map.ground_s_per_m, cost_map.prior_s_per_m
-        self._colours = colours = GroundColours(self._mesh, terrain, now, scene.truth, prior)
+        self._colours = colours = ground_colours.GroundColours(self._mesh, terrain, now, scene.truth, prior)
         self._colours.close(closed_cells(self._zones))
         drawn_by = {
-            PHOTO: colours.photo_of,
-            COST: colours.cost_of,
-            KNOWN: colours.known_of,
-            LEARNED: colours.learned_of,
+            live_layout.PHOTO: colours.photo_of,
+            live_layout.COST: colours.cost_of,
+            live_layout.KNOWN: colours.known_of,
+            live_layout.LEARNED: colours.learned_of,
         }
         self._tiled = {layer: picture for layer, picture in drawn_by.items() if layer in scene.layers}
         """Function that draws a tile of each layer of tiles."""
         self._stale: dict[str, dict[int, None]] = {layer.name: {} for layer in self._tiled}
         """Name of a layer -> its tiles that are out of date. Marks come many times a second to the same tiles, and
         each of their pictures is drawn once for all; one that looks as before is not logged again."""
-        self._nearest = any(layer.name == NEAREST.name for layer in scene.layers)
+        self._nearest = any(layer.name == live_layout.NEAREST.name for layer in scene.layers)
         self._to_target = next((layer for layer in scene.layers if layer.target is not None), None)
-        self.samples = CostSamples(terrain.grid, self._to_target and self._to_target.target)
-        self._pictures = TargetPictures(self._mesh, colours, self.samples)
+        self.samples = ground_colours.CostSamples(terrain.grid, self._to_target and self._to_target.target)
+        self._pictures = ground_colours.TargetPictures(self._mesh, colours, self.samples)
         self._limit = RateLimit(_EVERY_S)
         self._zones_version = 0
 
@@ -158,7 +139,9 @@ class GroundView:
         fine, coarse = self._mesh.mesh_tiles(), self._mesh.mesh_tiles(coarser=2)
         whole = [self._mesh.whole(_WHOLE_SIDE)]
         for layer in self._shown:
-            for n, tile in enumerate(fine if layer == PHOTO else coarse if layer in self._tiled else whole):
+            for n, tile in enumerate(
+                fine if layer == live_layout.PHOTO else coarse if layer in self._tiled else whole
+            ):
                 self._pen.log(f"{layer.entity}/{n}", _mesh(tile), static=True)
             self._legend(layer)
         self._pen.style("world/zones", _LINE_PX)
@@ -195,7 +178,7 @@ class GroundView:
         if layer is not None and layer.target == reply.target and reply.target in self.samples.costs_s:
             self._draw_to_target(layer, reply.target)
         if self._nearest and self.samples.costs_s and self._limit.due("nearest", now_ns):
-            self._texture(NEAREST.entity, 0, self._pictures.territories(self._target_ids))
+            self._texture(live_layout.NEAREST.entity, 0, self._pictures.territories(self._target_ids))
 
     def tick(self, now_ns: int, watched: bool) -> str | None:
         """Draws changes, at intervals. Returns the target whose planner is to be asked for costs now."""
@@ -217,7 +200,7 @@ class GroundView:
             for stale in self._stale.values():
                 stale.update(changed)
 
-    def _draw_tiles(self, layer: Layer, most: int) -> None:
+    def _draw_tiles(self, layer: live_layout.Layer, most: int) -> None:
         stale = self._stale[layer.name]
         for tile in list(stale)[:most]:
             del stale[tile]
@@ -235,32 +218,38 @@ class GroundView:
         )
         self._pen.log(f"{entity}/{tile}", texture)
 
-    def _legend(self, layer: Layer) -> None:
+    def _legend(self, layer: live_layout.Layer) -> None:
         """Draws the legend below a layer: once, but for a cost-to-go whenever its scale changes."""
         scale, pictures = None, self._pictures
-        if layer == COST:  # from high to low, evenly in the logarithm of the pace
+        if layer == live_layout.COST:  # from high to low, evenly in the logarithm of the pace
             paces = np.geomspace(self._colours.slowest_s_per_m, self._colours.quickest_s_per_m, 5)
-            scale = Scale(COST_COLOURS, "seconds a kilometre", [f"{pace * 1000:.3g}" for pace in paces])
-        elif layer == LEARNED:
-            scale = Scale(LEARNED_COLOURS, "times the prior pace", ["1/4", "1/2", "1", "2", "4"])
+            scale = live_layout.Scale(
+                ground_colours.COST_COLOURS, "seconds a kilometre", [f"{pace * 1000:.3g}" for pace in paces]
+            )
+        elif layer == live_layout.LEARNED:
+            scale = live_layout.Scale(
+                ground_colours.LEARNED_COLOURS, "times the prior pace", ["1/4", "1/2", "1", "2", "4"]
+            )
         elif layer.target is not None and pictures.full_s:
             seconds = [float(f"{each:.3g}") for each in np.linspace(0, pictures.full_s, 6)]
-            scale = Scale(COST_TO_GO_COLOURS, f"seconds to {layer.target}", [f"{each:g}" for each in seconds])
-        picture = legend_picture((*layer.looks, *self._movers), scale)
+            scale = live_layout.Scale(
+                ground_colours.COST_TO_GO_COLOURS, f"seconds to {layer.target}", [f"{each:g}" for each in seconds]
+            )
+        picture = live_layout.legend_picture((*layer.looks, *self._movers), scale)
         image = rr.EncodedImage(contents=picture, media_type="image/png")
         self._pen.log(f"legend/{layer.name}", image, static=True)
 
-    def _draw_to_target(self, layer: Layer, target: str) -> None:
+    def _draw_to_target(self, layer: live_layout.Layer, target: str) -> None:
         before_s = self._pictures.full_s
         self._texture(layer.entity, 0, self._pictures.to_target(target))
         lines, radii = self._pictures.tree(target)
-        self._pen.log(f"{layer.entity}/tree", rr.LineStrips3D(lines, colors=[TREE], radii=radii))
+        self._pen.log(f"{layer.entity}/tree", rr.LineStrips3D(lines, colors=[ground_colours.TREE], radii=radii))
         if self._pictures.full_s != before_s:
             self._legend(layer)
 
     def _draw_zones(self) -> None:
         parts = [borders(self._mesh, area) for area in self._zones]
-        per_zone = np.array([ZONE_COLOURS[area.rule] for area in self._zones], np.uint8).reshape(-1, 3)
+        per_zone = np.array([live_layout.ZONE_COLOURS[area.rule] for area in self._zones], np.uint8).reshape(-1, 3)
         colours = np.repeat(per_zone, [len(part) for part in parts], axis=0)
         self._pen.lines("world/zones", even(np.concatenate([np.empty((0, 2, 3), np.float32), *parts])), colours)
         named = self._zones[:_NAMES_SHOWN]

@@ -13,14 +13,8 @@ from pathlib import Path
 
 from PIL import Image
 
+from launch_scripts.monitor import live_layout
 from launch_scripts.monitor.ground_view import GroundView, Scene, scenario_areas
-from launch_scripts.monitor.live_layout import (
-    FiguresPanel,
-    level_of,
-    make_blueprint,
-    shown_layers,
-    summary_markdown,
-)
 from launch_scripts.monitor.movers_view import MoversView
 from launch_scripts.monitor.rerun_outputs import Pen, RateLimit, Sinks, new_recording_path
 from launch_scripts.monitor.terrain_mesh import TerrainMesh
@@ -103,7 +97,7 @@ class MonitorService:
         cost_map = CostMap(terrain, learning=scenario.map.learning)
         replica = MapReplica(terrain.grid, cost_map)
         self._sync = MapSync(replica, bus, post, scenario.map, setup.role, at_ticks=True)
-        self._panel = FiguresPanel(scene.pen, scenario.target_ids)
+        self._panel = live_layout.FiguresPanel(scene.pen, scenario.target_ids)
         self._movers = MoversView(scene.pen, scenario, self.observed, self.counters, replica.filter)
         self._ground = GroundView(scene, terrain, cost_map, replica, scenario, self._movers.looks.legend())
         self._observer = RunObserver(bus, post, self.observed, _READ)
@@ -182,7 +176,7 @@ class MonitorService:
             case PlannerStatus() as status:
                 self._ground.hear_status(status)
             case Note() as note:
-                self._panel.note(f"{note.role} {note.id}: {note.text}", level_of(note.kind))
+                self._panel.note(f"{note.role} {note.id}: {note.text}", live_layout.level_of(note.kind))
 
     def _alive(self, peer: Peer, up: bool, now_ns: int) -> None:
         self.observed.alive(peer, up, now_ns)
@@ -231,7 +225,7 @@ class MonitorService:
             state = state_of(self.observed, now_ns)
             self._movers.summarised(state)
             self._panel.plots(state)
-            self._panel.summary(summary_markdown(self._setup, state))
+            self._panel.summary(live_layout.summary_markdown(self._setup, state))
             self.figures = [facts.fact("elapsed_s").labelled(state), *facts.lines(state)]
 
 
@@ -257,8 +251,8 @@ def load_view(
     mesh = TerrainMesh(seen, config.height_factor, class_terrains(scenario, seen, aloft_classes(scenario)))
     del seen
     knows_truth = scenario.terrain.hidden != HiddenConfig()
-    layers = shown_layers(scenario, knows_truth=knows_truth)
-    blueprint = make_blueprint(mesh, layers, vehicles=scenario.vehicle_count, follow=config.follow)
+    layers = live_layout.shown_layers(scenario, knows_truth=knows_truth)
+    blueprint = live_layout.make_blueprint(mesh, layers, vehicles=scenario.vehicle_count, follow=config.follow)
     path = None if setup.run_dir is None else new_recording_path(setup.run_dir)
     sinks = Sinks(f"{setup.run_id}.{setup.incarnation:x}", path, config, blueprint, page)
     closing.callback(sinks.close)

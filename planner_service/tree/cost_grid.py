@@ -12,18 +12,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from planner_service.kernels import cell_costs as kernels
-from planner_service.kernels import repair, route_walk
+from planner_service.kernels import layout, repair, route_walk
 from planner_service.kernels.climbs import Climbs, row_scratch, with_scratch
-from planner_service.kernels.layout import (
-    RULE_FOUR,
-    RULE_OCTILE,
-    RULE_PAPER,
-    SQRT2,
-    SQRT2_EXACT,
-    Buckets,
-    PaddedGrid,
-    step_offsets,
-)
 from planner_service.tree.cost_changes import NO_CHANGES, Cells, Changes, CostRange, Rounding, joined
 from planner_service.tree.queue_choice import grow_tree
 from shared_map.array_files import Bools, Floats, private_copy
@@ -61,8 +51,8 @@ _NO_STATUSES: NDArray[np.uint8] = np.empty(0, np.uint8)
 
 def rule_of(config: PlannerConfig) -> int:
     if config.neighbours == 4:
-        return RULE_FOUR
-    return RULE_OCTILE if config.edge == "octile" else RULE_PAPER
+        return layout.RULE_FOUR
+    return layout.RULE_OCTILE if config.edge == "octile" else layout.RULE_PAPER
 
 
 _SHORTEST_M, _LONGEST_M = 1e-30, 1e30
@@ -99,7 +89,7 @@ class CostGrid:
         """Cells of a padded row."""
         self.size = (grid.rows + 2) * self.stride
         """Cells of a padded array."""
-        self.diagonal = SQRT2_EXACT if self.rule == RULE_OCTILE else 1.0
+        self.diagonal = layout.SQRT2_EXACT if self.rule == layout.RULE_OCTILE else 1.0
         """Length of a diagonal step in straight ones."""
         self.climbs: Climbs | None = None
         """Effect of a step's rise on its cost, for kernels; None if entering a cell costs the same from every side.
@@ -134,7 +124,7 @@ class CostGrid:
         self._range = self._time_range = CostRange(_NONE)
         """Range of `cell_cost` and of `_time_cost`. `load` and `share` put others in their place, `apply` changes
         them: those of a snapshot are not its own."""
-        self._offsets = step_offsets(self.stride)
+        self._offsets = layout.step_offsets(self.stride)
         self._shared: Floats | None = None
         """The original `cell_cost`, if that is mapped: `share` sets it, `load` resets it."""
         self._written: Bools = np.zeros(self.size // _BLOCK + 1, np.bool_)
@@ -154,12 +144,12 @@ class CostGrid:
             self.climbs = with_scratch(self.climbs)
 
     @property
-    def padded(self) -> PaddedGrid:
+    def padded(self) -> layout.PaddedGrid:
         """The same for kernels."""
         return self.cell_cost, self._offsets, self.stride, self.rule, self.corners
 
     @property
-    def buckets(self) -> Buckets:
+    def buckets(self) -> layout.Buckets:
         """Buckets of a repair: as wide as the lowest cell cost, and enough for costs at most a step higher."""
         longest = self.highest_cell_cost * self.dearest_step
         count = math.ceil(longest / self.lowest_cell_cost) + 2
@@ -413,7 +403,7 @@ def _padded_climbs(climb: Climb, rule: int) -> tuple[Climbs, float]:
     grid = climb.grid
     height = np.zeros((grid.rows + 2, grid.cols + 2), np.float32)
     height[1:-1, 1:-1] = climb.elevation_m
-    diagonal = {RULE_FOUR: np.float32(np.inf), RULE_OCTILE: SQRT2}.get(rule, np.float32(1.0))
+    diagonal = {layout.RULE_FOUR: np.float32(np.inf), layout.RULE_OCTILE: layout.SQRT2}.get(rule, np.float32(1.0))
     tables = climb.table[: 8 if climb.windy else 2] / np.float32(climb.lowest)
     tables[1::2] *= diagonal
     begins = (np.arange(8) % len(tables) * tables.shape[1]).astype(np.int32)

@@ -17,19 +17,6 @@ from numpy.typing import NDArray
 from planner_service.kernels import partition, partition_search, partition_totals
 from planner_service.kernels.layout import NONE, PaddedGrid
 from planner_service.kernels.lower_bounds import WindowBound
-from planner_service.kernels.partition import (
-    ALTERED,
-    CELLS,
-    CHECK,
-    MOST_SLACK,
-    NO_PIECE,
-    PIECES,
-    RELINK,
-    SIDE,
-    Schedule,
-    Tiles,
-    Tree,
-)
 from planner_service.tree.cost_changes import Cells, Changes
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree, grow_window
@@ -72,15 +59,15 @@ class PartitionedTree:
         self.root = -1
         self.exact = False
         self.window_bound: WindowBound | None = None
-        self._across = -(-cost_grid.grid.cols // SIDE)
-        self._count = count = -(-cost_grid.grid.rows // SIDE) * self._across
-        self._piece = np.full(count * CELLS, NO_PIECE, np.uint8)
-        self._rim = np.zeros(count * PIECES, np.float64)
+        self._across = -(-cost_grid.grid.cols // partition.SIDE)
+        self._count = count = -(-cost_grid.grid.rows // partition.SIDE) * self._across
+        self._piece = np.full(count * partition.CELLS, partition.NO_PIECE, np.uint8)
+        self._rim = np.zeros(count * partition.PIECES, np.float64)
         self._totals = partition.make_totals(count)
         self._wanted = np.zeros(count, np.uint8)
         self._ends = np.zeros((2, count), np.float64)
-        self._tiles = Tiles(
-            exits=np.zeros(count * PIECES, np.uint8),
+        self._tiles = partition.Tiles(
+            exits=np.zeros(count * partition.PIECES, np.uint8),
             many=np.zeros(count, np.int32),
             wanted=self._wanted,
             falls=np.zeros((3, count), np.float64),
@@ -89,7 +76,7 @@ class PartitionedTree:
         )
         self._scratch = partition.make_scratch(count, MOST_KEPT)
         self._now = 0
-        self._stack = np.empty(count * PIECES, np.int32)
+        self._stack = np.empty(count * partition.PIECES, np.int32)
         self._words = np.zeros((6, -(-count // 8)), np.int64)
         self._at_once = np.zeros(count)
         self._most = MOST_LOOKS * count + 64
@@ -100,10 +87,10 @@ class PartitionedTree:
         """The root has moved since totals were added up."""
 
     @property
-    def _arrays(self) -> tuple[PaddedGrid, Tree]:
+    def _arrays(self) -> tuple[PaddedGrid, partition.Tree]:
         """(map, tree) for kernels."""
         grid = self.cost_grid
-        return grid.padded, Tree(self.parent, self._piece, self._rim, *self._totals, grid.pad(self.root))
+        return grid.padded, partition.Tree(self.parent, self._piece, self._rim, *self._totals, grid.pad(self.root))
 
     def grow(self, root: int) -> None:
         """Grows the whole tree of a cell, exactly. Raises OutsideGridError if it is none of the grid, ValueError if
@@ -119,11 +106,11 @@ class PartitionedTree:
         self.cost_grid.check_root(root)
         self.parent = parent
         self.root = root
-        self._wanted[:] = CHECK | RELINK
-        row, col = (at // SIDE for at in self.cost_grid.grid.row_col(root))
+        self._wanted[:] = partition.CHECK | partition.RELINK
+        row, col = (at // partition.SIDE for at in self.cost_grid.grid.row_col(root))
         rows, cols = np.divmod(np.arange(self._count), self._across)
         self._ends[0] = np.maximum(np.abs(rows - row), np.abs(cols - col))
-        self._relabel(np.full(self._count, ALTERED))
+        self._relabel(np.full(self._count, partition.ALTERED))
         self._moved = True
         self._mend(math.inf, self._at_once)
 
@@ -196,7 +183,7 @@ class PartitionedTree:
     def slack(self) -> tuple[float, float]:
         """Same as in `CostToGoTree`. Cell costs are float32, a few roundings; each step may leave `MOST_SLACK` of
         its cell's cost, and `Rounding` counts 2**24 for one."""
-        return 2.0**-21, MOST_SLACK * 2.0**24
+        return 2.0**-21, partition.MOST_SLACK * 2.0**24
 
     def tighten(self, cells: Cells) -> None:
         """Does nothing: costs are always those driven."""
@@ -205,7 +192,7 @@ class PartitionedTree:
         """Labels again the changed tiles: uint8 (n,), `partition.COSTLIER` or more."""
         partition.relabel_tiles(*self._arrays, self._tiles, self._scratch, np.flatnonzero(changed), changed)
 
-    def _schedule(self, turn: NDArray[np.float64]) -> Schedule:
+    def _schedule(self, turn: NDArray[np.float64]) -> partition.Schedule:
         """Returns the schedule for `improve_tiles`; totals are up to date after that call."""
         self._now += self._moved
         now = self._now if self._moved else 0
@@ -213,7 +200,7 @@ class PartitionedTree:
         order = np.argsort(self._ends[0])
         place = np.empty_like(order)
         place[order] = np.arange(order.size)
-        return Schedule(order, place, turn, now, self._stack, self._words.view(np.uint8), self._words)
+        return partition.Schedule(order, place, turn, now, self._stack, self._words.view(np.uint8), self._words)
 
     def _add_up(self) -> None:
         """Evaluates the totals."""
@@ -226,7 +213,7 @@ class PartitionedTree:
         )
         self.exact = not left
         self.work = looked, mended, rounds
-        return int(looked) * CELLS
+        return int(looked) * partition.CELLS
 
 
 AnyTree = CostToGoTree | PartitionedTree

@@ -25,17 +25,7 @@ from swarm.places import cell_of
 from swarm.runtime import order_book
 from swarm.runtime.membership import Member
 from swarm.runtime.order_book import FreshOrders, GoalBook, OrderBook
-from swarm.wire.messages import Nothing
-from swarm.wire.messages.orders import (
-    GiveOrder,
-    Goals,
-    GoalStates,
-    Order,
-    Orders,
-    SendVehicle,
-    VehicleGoals,
-    ZoneOrder,
-)
+from swarm.wire.messages import Nothing, orders
 from swarm.wire.topics import GIVE_ORDER, GOAL_STATES, GOALS, ORDERS, SEND_VEHICLE
 
 _PUBLISH_NS = NS_PER_S
@@ -78,8 +68,8 @@ class KeptOrders:
         self._on_ground = {plan.id for plan in plans if plan.group.vehicle_class == GROUND}
         """Agents whose vehicles find the terrain's own lethal cells lethal."""
         self._publish_due_ns = 0
-        self._unsaved: list[Order] = []
-        self._unsaved_goals: list[VehicleGoals] = []
+        self._unsaved: list[orders.Order] = []
+        self._unsaved_goals: list[orders.VehicleGoals] = []
         """News of other keepers and agents that is not on our disk yet."""
 
     def start(self, now_ns: int) -> None:
@@ -105,13 +95,13 @@ class KeptOrders:
                     self._added.add(id)
             case Disappeared(peer=Peer(role="agent")):
                 pass
-            case Heard(message=Orders() as orders) | Replied(message=Orders() as orders):
-                self._unsaved += self.book.merge(orders.orders, now_ns)
-            case Heard(message=Goals(id=id)) if id == self._id:
+            case Heard(message=orders.Orders() as book) | Replied(message=orders.Orders() as book):
+                self._unsaved += self.book.merge(book.orders, now_ns)
+            case Heard(message=orders.Goals(id=id)) if id == self._id:
                 pass
-            case Heard(message=Goals() as goals) | Replied(message=Goals() as goals):
+            case Heard(message=orders.Goals() as goals) | Replied(message=orders.Goals() as goals):
                 self._unsaved_goals += self.goals.merge(goals.goals, now_ns)
-            case Heard(message=GoalStates() as reached):
+            case Heard(message=orders.GoalStates() as reached):
                 held = ((self.goals.get(each.name), each) for each in reached.states)
                 news = [
                     replace(goals, done=new.done) for goals, new in held if goals and goals.stamp_ns == new.stamp_ns
@@ -125,7 +115,7 @@ class KeptOrders:
 
     def _answered(self, asked: Asked, now_ns: int) -> bool:
         """Answers a query about orders; false if it is about something else."""
-        given: Order | VehicleGoals | str | None = None
+        given: orders.Order | orders.VehicleGoals | str | None = None
         match asked.request:
             case _ if asked.topic is ORDERS:
                 asked.answer(self._orders(), role="keeper", id=self._id)
@@ -133,18 +123,18 @@ class KeptOrders:
                 known = {agent_of(each.name) for each in self.goals}
                 for agent in sorted(known) if asked.fields["agent"] == "*" else [asked.fields["agent"]]:
                     asked.answer(self._goals_of(agent), agent=agent)
-            case GiveOrder() as order:
+            case orders.GiveOrder() as order:
                 given = None if order.subject is None else self._take(order, now_ns)
-                if isinstance(given, Order):
+                if isinstance(given, orders.Order):
                     self._bus.publish(ORDERS, self._orders(), role="keeper", id=self._id)
                 if not isinstance(given, str):
                     asked.answer(self._orders(given), keeper=self._id)
-            case SendVehicle() as order:
+            case orders.SendVehicle() as order:
                 given = self._send(order, now_ns) if order.changes else None
-                if isinstance(given, VehicleGoals):
+                if isinstance(given, orders.VehicleGoals):
                     self._tell(agent_of(given.name))
                 if not isinstance(given, str):
-                    asked.answer(Goals(id=self._id, goals=list(self.goals), given=given), keeper=self._id)
+                    asked.answer(orders.Goals(id=self._id, goals=list(self.goals), given=given), keeper=self._id)
             case _:
                 return False
         if isinstance(given, str):
@@ -164,7 +154,9 @@ class KeptOrders:
     def stale(self, asked: Asked, now_ns: int) -> str | None:
         """Reason why an order of a person or a zone is none that is given now; None for all other queries."""
         match asked.request:
-            case (GiveOrder() | ZoneOrder() | SendVehicle()) as order if order.changes and self._fresh is not None:
+            case (orders.GiveOrder() | orders.ZoneOrder() | orders.SendVehicle()) as order if (
+                order.changes and self._fresh is not None
+            ):
                 return self._fresh.fault(order.stamp_ns, now_ns)
         return None
 
@@ -188,7 +180,7 @@ class KeptOrders:
         vehicles = [id for plan in plan_agents(self._scenario) for id in plan.vehicle_ids]
         return [*vehicles, asked] if agent_of(asked) in self._added else vehicles
 
-    def _take(self, given: GiveOrder, now_ns: int) -> Order | str:
+    def _take(self, given: orders.GiveOrder, now_ns: int) -> orders.Order | str:
         try:
             given = self._placed(given)
         except ConfigError as error:
@@ -209,7 +201,7 @@ class KeptOrders:
         self.book.merge([order], now_ns)
         return order
 
-    def _placed(self, given: GiveOrder) -> GiveOrder:
+    def _placed(self, given: orders.GiveOrder) -> orders.GiveOrder:
         """With a cell for a place, or for row and column: outside the grid that is none. Raises ConfigError."""
         grid = self._terrain.grid
         if given.at:
@@ -219,8 +211,8 @@ class KeptOrders:
         inside = grid.inside(given.row, given.col)
         return replace(given, cell=grid.cell(given.row, given.col) if inside else grid.cells, row=None, col=None)
 
-    def _orders(self, given: Order | None = None) -> Orders:
-        return Orders(role="keeper", id=self._id, orders=list(self.book), given=given)
+    def _orders(self, given: orders.Order | None = None) -> orders.Orders:
+        return orders.Orders(role="keeper", id=self._id, orders=list(self.book), given=given)
 
     def _lethal(self, cells: Sequence[int]) -> str | None:
         """The first of these cells that is lethal, in a sentence; None if none is."""
@@ -233,11 +225,11 @@ class KeptOrders:
     def _tell(self, agent: str) -> None:
         self._bus.publish(GOALS, self._goals_of(agent), id=self._id, agent=agent)
 
-    def _goals_of(self, agent: str) -> Goals:
+    def _goals_of(self, agent: str) -> orders.Goals:
         ours = [goals for goals in self.goals if agent_of(goals.name) == agent]
-        return Goals(id=self._id, agent=agent, goals=ours, shared=shared_by(self.goals, ours))
+        return orders.Goals(id=self._id, agent=agent, goals=ours, shared=shared_by(self.goals, ours))
 
-    def _send(self, given: SendVehicle, now_ns: int) -> VehicleGoals | str:
+    def _send(self, given: orders.SendVehicle, now_ns: int) -> orders.VehicleGoals | str:
         vehicle, grid = given.vehicle, self._terrain.grid
         if (fault := order_book.fault_of_vehicle(vehicle, self._vehicles_with(vehicle))) is not None:
             return fault
@@ -247,7 +239,7 @@ class KeptOrders:
             cells = [cell_of(place, MapFrame(grid), "place") for place in given.places]
             if (fault := self._fault_of(given, cells)) is not None:
                 return f"vehicle {vehicle}: {fault}"
-            goals = VehicleGoals(
+            goals = orders.VehicleGoals(
                 name=vehicle, stamp_ns=self.goals.stamp_after(vehicle, now_ns), off=given.off, cells=cells,
                 then=given.then,
             )  # fmt: skip
@@ -259,7 +251,7 @@ class KeptOrders:
         self.goals.merge([goals], now_ns)
         return goals
 
-    def _fault_of(self, given: SendVehicle, cells: Sequence[int]) -> str | None:
+    def _fault_of(self, given: orders.SendVehicle, cells: Sequence[int]) -> str | None:
         """Reason why the vehicle cannot go to these cells. Planners know what is lethal for other classes."""
         if given.then == "repeat" and len(set(cells)) < 2:
             return "to repeat, expected two different places or more"
@@ -269,7 +261,7 @@ class KeptOrders:
         return None if fault is None else f"place {fault}"
 
 
-def shared_by(all: Iterable[VehicleGoals], ours: Iterable[VehicleGoals]) -> list[tuple[int, int]]:
+def shared_by(all: Iterable[orders.VehicleGoals], ours: Iterable[orders.VehicleGoals]) -> list[tuple[int, int]]:
     """(cell, how many vehicles were sent there) of each of our cells to which more than one was."""
     sent = Counter(cell for goals in all for cell in set(goals.cells))
     return [

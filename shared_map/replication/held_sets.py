@@ -178,15 +178,11 @@ class HeldSets:
         newer = self.ledger.ahead(theirs, authors, after, until)
         return [self._tiles[tile][author] for author, tiles in newer for tile in tiles]
 
-    def answer(self, request: MarksRequest, author: str | None = None) -> list[MarkSet]:
-        """The sets asked for, in order of tile and author.
+    def asked(self, request: MarksRequest, author: str | None = None) -> Iterator[MarkSet | None]:
+        """The sets asked for, in order of tile and author, with None after each tile.
 
         author  only this author's, as the key of the query says
         """
-        return [each for each in self.asked(request, author) if each is not None]
-
-    def asked(self, request: MarksRequest, author: str | None = None) -> Iterator[MarkSet | None]:
-        """The sets of `answer`, lazily, with None after each tile."""
         wanted = frozenset(request.authors)
         every = self.tiles if author is None else self.ledger.tiles_of(author)
         for tile in sorted(set(request.tiles)) if request.tiles else every:

@@ -21,17 +21,7 @@ from shared_map.replication.tiles import beyond_region, beyond_tile, of_all_clas
 from swarm.bus.bus import Asked, AskEnded, Bus, Event, HeardMany, LinkChanged, Post, Replied
 from swarm.clock import NS_PER_S
 from swarm.config.scenario import MapConfig
-from swarm.wire.messages import Message
-from swarm.wire.messages.map_data import (
-    MOST_DIGEST_BYTES,
-    MOST_TILES_ASKED,
-    Digest,
-    MarkSet,
-    MarkSets,
-    MarksRequest,
-    is_keeper,
-    owner_of,
-)
+from swarm.wire.messages import Message, map_data
 from swarm.wire.topics import DIGEST, MARKS
 
 log = logging.getLogger(__name__)
@@ -56,7 +46,7 @@ _OFFERS_AT_ONCE = 256
 """Sets given to keepers in a period of digests; the next ones show what they still lack."""
 _LOOKS_PER_TICK = 1024
 """Authors whose sets are compared for offers in one tick, some 15 ms: names cost a sender nothing."""
-_TILES_AT_ONCE = MOST_TILES_ASKED
+_TILES_AT_ONCE = map_data.MOST_TILES_ASKED
 """Named in one question: the tiles of a large map are more than a message has room for."""
 _ANSWERS_PER_TICK, _TURN = 8192, 1024
 """Sets and tiles looked at for answers in one tick, some 10 ms, and for one asker before another has its turn."""
@@ -64,7 +54,7 @@ _LEAST_COST, _SINGLE_COST = 32, 16
 """Cost of a question, and of a set that is sent by itself, in sets that are sent together."""
 _MOST_ANSWERS = 1024
 """Questions for sets that wait: of all agents that start at once."""
-_PART_BYTES = MOST_DIGEST_BYTES - 512
+_PART_BYTES = map_data.MOST_DIGEST_BYTES - 512
 """Rows and names of authors in one digest, without its other fields."""
 _QUANTUM = 16_384
 """Statements of one author that are merged before its quota is looked at again."""
@@ -107,7 +97,7 @@ class MapSync:
         name: str | None = None,
         serves_all: bool = False,
         committed: Callable[[], dict[str, bytes]] | None = None,
-        on_accepted: Callable[[MarkSet], None] = lambda mark_set: None,
+        on_accepted: Callable[[map_data.MarkSet], None] = lambda mark_set: None,
         on_digest: Callable[[str, int], None] = lambda author, now_ns: None,
         near: bool = False,
         at_ticks: bool = False,
@@ -134,7 +124,7 @@ class MapSync:
         self._digest_seq = 0
         # Parts of the whole digest that are not published yet, as `parts_of` gives them.
         # Questions for sets: each with whether sets may come together, and the sets to come.
-        self._answers: deque[tuple[Asked, bool, Iterator[MarkSet | None]]] = deque()
+        self._answers: deque[tuple[Asked, bool, Iterator[map_data.MarkSet | None]]] = deque()
         self._answers_left = _ANSWERS_PER_TICK
         self._parts: deque[tuple[dict[str, bytes], Place | None, Place | None]] = deque()
         self._offers_left = self._offers_due_ns = 0  # sets that may still be given until then
@@ -179,7 +169,7 @@ class MapSync:
         if not before:
             tiles.append(beyond_tile(grid))
         for first in range(0, len(tiles), _TILES_AT_ONCE):
-            request = MarksRequest(tiles=tiles[first : first + _TILES_AT_ONCE], bulk=True)
+            request = map_data.MarksRequest(tiles=tiles[first : first + _TILES_AT_ONCE], bulk=True)
             self._bus.ask(MARKS, request, self._post, tag=_ENTER)
 
     def _listen(self, **fields: int) -> None:
@@ -203,7 +193,7 @@ class MapSync:
                 self._join_ended(event, now_ns)
             case AskEnded(tag=tag) if tag.startswith(_RESYNC):
                 self._asked_ns.pop(tag.removeprefix(_RESYNC), None)
-            case Asked(topic=topic, request=MarksRequest() as request) if topic is MARKS:
+            case Asked(topic=topic, request=map_data.MarksRequest() as request) if topic is MARKS:
                 self._answer(event, request)
             case LinkChanged(up=True):
                 self._digest_due_ns = now_ns  # what the others missed; theirs come within digest_s
@@ -217,7 +207,7 @@ class MapSync:
     def tick(self, now_ns: int) -> None:
         """Publishes what is due, compares the digests that have waited long enough, and requests missing sets."""
         for digest in self._bus.collected(DIGEST):
-            assert isinstance(digest.message, Digest)
+            assert isinstance(digest.message, map_data.Digest)
             self._on_digest(digest.message.author, now_ns)
             self._receive_digest(digest.message, now_ns)
         self._answers_left = _ANSWERS_PER_TICK
@@ -233,7 +223,7 @@ class MapSync:
             self._compare(pending, now_ns)
         self._send_digest(now_ns)
 
-    def publish(self, actions: Iterable[MarkSet]) -> None:
+    def publish(self, actions: Iterable[map_data.MarkSet]) -> None:
         """Puts the sets that the replica decided to publish."""
         for action in actions:
             self._put(action)
@@ -254,7 +244,7 @@ class MapSync:
 
     # --- sets -----------------------------------------------------------------------------------------------
 
-    def _put(self, mark_set: MarkSet) -> None:
+    def _put(self, mark_set: map_data.MarkSet) -> None:
         if mark_set.author == self.replica.author:
             self._changed.setdefault(mark_set.tile, None)
         region = region_of(self.replica.grid, mark_set.tile)
@@ -269,17 +259,17 @@ class MapSync:
         """Sets that were put, each under the key of its tile and author: access is granted by key."""
         sets = [
             each for key, each in samples
-            if isinstance(each, MarkSet) and key.endswith(f"/{each.tile}/{each.author}")
+            if isinstance(each, map_data.MarkSet) and key.endswith(f"/{each.tile}/{each.author}")
         ]  # fmt: skip
         self.replica.counts["sets_refused"] += len(samples) - len(sets)
         self._admit(sets, now_ns)
 
-    def _sets_in(self, event: Replied) -> list[MarkSet]:
+    def _sets_in(self, event: Replied) -> list[map_data.MarkSet]:
         """The sets in a reply; none if its key names another author or tile."""
         match event.message:
-            case MarkSets(author=author) as many if event.fields.get("tile") == _MANY:
+            case map_data.MarkSets(author=author) as many if event.fields.get("tile") == _MANY:
                 sets = unpacked(many)
-            case MarkSet(author=author, tile=tile) as one if event.fields.get("tile") == str(tile):
+            case map_data.MarkSet(author=author, tile=tile) as one if event.fields.get("tile") == str(tile):
                 sets = [one]
             case _:
                 author, sets = "", []
@@ -288,9 +278,9 @@ class MapSync:
             return []
         return sets
 
-    def _admit(self, sets: Sequence[MarkSet], now_ns: int) -> None:
+    def _admit(self, sets: Sequence[map_data.MarkSet], now_ns: int) -> None:
         """Merges sets now; sets of authors that exceed their quota wait."""
-        taken: list[MarkSet] = []
+        taken: list[map_data.MarkSet] = []
         marks: dict[str, int] = {}  # author -> number of its statements that are taken
         for each in sets:
             author = each.author
@@ -299,13 +289,13 @@ class MapSync:
                 self._merge_charged(taken, marks, now_ns)
                 taken, marks, stated = [], {}, None
             if stated is None and not self._quota.admits(each, now_ns):
-                self._warn_once(owner_of(author), "exceeds its quota; its marks are delayed", now_ns)
+                self._warn_once(map_data.owner_of(author), "exceeds its quota; its marks are delayed", now_ns)
                 continue
             taken.append(each)
             marks[author] = (stated or 0) + len(each.kinds)
         self._merge_charged(taken, marks, now_ns)
 
-    def _merge_charged(self, sets: Sequence[MarkSet], authors: Iterable[str], now_ns: int) -> None:
+    def _merge_charged(self, sets: Sequence[map_data.MarkSet], authors: Iterable[str], now_ns: int) -> None:
         costs = dict.fromkeys(authors, 0)
         merged = self._merge(sets, measured=True)
         for author in {each.author for each in merged.sets} - {self.replica.author}:
@@ -326,7 +316,7 @@ class MapSync:
             self._quota.charge(mark_set.author, sum(merged.changed), now_ns)
         self._quota.forget(now_ns)
 
-    def _merge(self, sets: Sequence[MarkSet], *, measured: bool) -> Merged:
+    def _merge(self, sets: Sequence[map_data.MarkSet], *, measured: bool) -> Merged:
         merged = self.replica.merge(sets, measured=measured)
         for each in merged.sets:
             self._on_accepted(each)
@@ -339,7 +329,7 @@ class MapSync:
             self._warned_ns[author] = now_ns
             log.warning("author %s %s", author, what)
 
-    def _answer(self, asked: Asked, request: MarksRequest) -> None:
+    def _answer(self, asked: Asked, request: map_data.MarksRequest) -> None:
         named = asked.fields.get("author", "*")
         author = None if "*" in named else named
         if not self._serves_all:
@@ -355,7 +345,7 @@ class MapSync:
         """Answers queries for sets, by turns, until the work of this tick is done."""
         while self._answers and self._answers_left > 0:
             asked, bulk, found = self._answers.popleft()
-            sets: list[MarkSet] = []
+            sets: list[map_data.MarkSet] = []
             cost = _LEAST_COST
             for each in () if asked.expired else found:
                 if each is not None:
@@ -378,7 +368,7 @@ class MapSync:
     def _join(self) -> None:
         self._join_due_ns = None
         self._join_tries += 1
-        self._bus.ask(MARKS, MarksRequest(bulk=True), self._post, tag=_JOIN, timeout_s=_JOIN_TIMEOUT_S)
+        self._bus.ask(MARKS, map_data.MarksRequest(bulk=True), self._post, tag=_JOIN, timeout_s=_JOIN_TIMEOUT_S)
 
     def _join_ended(self, event: AskEnded, now_ns: int) -> None:
         if (event.replies and event.failure is None) or self._join_tries >= _JOIN_TRIES:
@@ -389,15 +379,15 @@ class MapSync:
 
     # --- digests --------------------------------------------------------------------------------------------
 
-    def _receive_digest(self, digest: Digest, now_ns: int) -> None:
-        if not is_keeper(digest.author):  # names its own sets only
+    def _receive_digest(self, digest: map_data.Digest, now_ns: int) -> None:
+        if not map_data.is_keeper(digest.author):  # names its own sets only
             held = {digest.author: rows} if (rows := digest.held.get(digest.author)) else {}
             digest = replace(digest, held=held)
         if digest.author == self._name or not self._digests.add(digest, now_ns):
             return
         if digest.author in self._received_ns or len(self._received_ns) < _MAX_NAMES:
             self._received_ns[digest.author] = now_ns
-        if is_keeper(digest.author) and digest.complete:
+        if map_data.is_keeper(digest.author) and digest.complete:
             self._digest_interest.keeper_spoke(digest.author, now_ns)
 
     def _choose_digests(self, now_ns: int) -> None:
@@ -442,7 +432,7 @@ class MapSync:
             elif now_ns >= until_ns:
                 del self._changed[tile]
         self._digest_seq += 1
-        digest = Digest(
+        digest = map_data.Digest(
             author=self._name,
             role=self._role,
             held=held,
@@ -459,9 +449,9 @@ class MapSync:
         digest = pending.digest
         missing = self.replica.missing(digest.held)
         for author, tiles in missing:
-            if owner_of(author) not in self._quota.waiting:  # else its sets wait here already
+            if map_data.owner_of(author) not in self._quota.waiting:  # else its sets wait here already
                 self._fetch(author, tiles, now_ns)
-        if is_keeper(digest.author) and digest.complete and not self._serves_all and pending.tries == 0:
+        if map_data.is_keeper(digest.author) and digest.complete and not self._serves_all and pending.tries == 0:
             self._offer(digest, now_ns)
         self._digests.compared(pending, not missing, now_ns)
 
@@ -472,10 +462,10 @@ class MapSync:
         again = asked_ns is not None and now_ns - asked_ns >= _ASK_AGAIN_NS
         if again or (asked_ns is None and len(self._asked_ns) < _MAX_ASKS):
             self._asked_ns[author] = now_ns
-            request = MarksRequest(authors=[author], tiles=tiles[:_TILES_AT_ONCE], bulk=True)
+            request = map_data.MarksRequest(authors=[author], tiles=tiles[:_TILES_AT_ONCE], bulk=True)
             self._bus.ask(MARKS, request, self._post, tag=_RESYNC + author, author=author)
 
-    def _offer(self, kept: Digest, now_ns: int) -> None:
+    def _offer(self, kept: map_data.Digest, now_ns: int) -> None:
         """Puts again what a keeper never got, and its author, being gone, cannot put again."""
         if now_ns >= self._offers_due_ns:
             self._offers_left, self._offers_due_ns = _OFFERS_AT_ONCE, now_ns + self._digest_ns

@@ -22,6 +22,7 @@ from typing import Any
 
 import zenoh
 
+from swarm.bus import zenoh_intake
 from swarm.bus.bus import (
     QUESTION_BYTES,
     QUESTION_COST_BYTES,
@@ -42,16 +43,6 @@ from swarm.bus.bus import (
 )
 from swarm.bus.endpoints import keeps_open, wait_for_router, why_not_listening, why_unreachable
 from swarm.bus.zenoh_config import patterned, session_config
-from swarm.bus.zenoh_intake import (
-    Arrivals,
-    Intake,
-    guarded,
-    is_json,
-    taken_after,
-    taken_from,
-    timeout_of,
-    waiting_in,
-)
 from swarm.config.scenario import NetworkConfig
 from swarm.errors import BusError, ProtocolError
 from swarm.liveness import Peer
@@ -75,11 +66,11 @@ class ZenohAnswerer:
         self._arrived_s = time.monotonic()
         self._asked = b"" if query.payload is None else query.payload.to_bytes()
         self._parameters = dict(list(query.parameters))  # type: ignore[call-overload]
-        self._as_json = is_json(query, self._asked) or self._parameters.get("format") == "json"
+        self._as_json = zenoh_intake.is_json(query, self._asked) or self._parameters.get("format") == "json"
         self._fault: ProtocolError | None = None
         self.timeout_s = USUAL_TIMEOUT_S
         try:
-            self.timeout_s = timeout_of(self._parameters.pop(TIMEOUT_PARAMETER, ""))
+            self.timeout_s = zenoh_intake.timeout_of(self._parameters.pop(TIMEOUT_PARAMETER, ""))
         except ProtocolError as error:
             self._fault = error
 
@@ -204,7 +195,7 @@ class ZenohBus:
         self._session = session
         self.proves_names = False
         self._namespace = namespace
-        self.intake = Intake(namespace, authenticator)
+        self.intake = zenoh_intake.Intake(namespace, authenticator)
         self._own_peers: list[Peer] = []
         """Our tokens, of which `watch_alive` does not tell."""
         self._entities: list[Any] = []
@@ -286,9 +277,9 @@ class ZenohBus:
         channel = subscriber.handler  # a thread that waits on the subscriber itself keeps it from being undeclared
         name = f"sub-{topic.name}"
         if together:
-            self._read(subscriber, arrive_together, name, partial(waiting_in, channel))
+            self._read(subscriber, arrive_together, name, partial(zenoh_intake.waiting_in, channel))
         elif every_s:
-            self._read(subscriber, arrive, name, partial(taken_after, channel, self._closing, every_s))
+            self._read(subscriber, arrive, name, partial(zenoh_intake.taken_after, channel, self._closing, every_s))
         else:
             self._read(subscriber, arrive, name, lambda: [channel.recv()])
 
@@ -300,7 +291,7 @@ class ZenohBus:
     def gather(self) -> None:
         for collecting in self._collecting.values():
             for subscriber, gathered in collecting:
-                gathered += taken_from(subscriber.handler, gathered.maxlen or 0)
+                gathered += zenoh_intake.taken_from(subscriber.handler, gathered.maxlen or 0)
 
     def collected(self, topic: Topic) -> list[Heard]:
         heard: list[Heard] = []
@@ -340,7 +331,7 @@ class ZenohBus:
             raise TypeError(f"topic {topic.name} is not a queryable")
         concrete = {name: str(value) for name, value in fields.items()}
 
-        arrivals = Arrivals(QUESTION_BYTES, lambda answerer: QUESTION_COST_BYTES + answerer.size)
+        arrivals = zenoh_intake.Arrivals(QUESTION_BYTES, lambda answerer: QUESTION_COST_BYTES + answerer.size)
 
         def enter(query: zenoh.Query) -> None:
             answerer = ZenohAnswerer(self, topic, concrete, query)
@@ -359,7 +350,7 @@ class ZenohBus:
                 post(asked)
 
         expression = self._pattern(topic, fields)
-        into = zenoh.handlers.Callback(guarded(enter), arrivals.end, indirect=False)
+        into = zenoh.handlers.Callback(zenoh_intake.guarded(enter), arrivals.end, indirect=False)
         queryable = self._session.declare_queryable(expression, into)
         self._queryables.setdefault(expression, []).append(queryable)
         if undecoded:
@@ -417,7 +408,7 @@ class ZenohBus:
         self.intake.sent(asked)
         self._session.get(
             f"{expression}?{TIMEOUT_PARAMETER}={timeout_s}",
-            zenoh.handlers.Callback(guarded(arrive), guarded(finish), indirect=False),
+            zenoh.handlers.Callback(zenoh_intake.guarded(arrive), zenoh_intake.guarded(finish), indirect=False),
             target=zenoh.QueryTarget.ALL,
             consolidation=zenoh.ConsolidationMode.NONE,
             timeout=timeout_s,
@@ -445,7 +436,7 @@ class ZenohBus:
             post(Appeared(peer) if sample.kind == zenoh.SampleKind.PUT else Disappeared(peer))
 
         key = ALIVE_KEY.format(role=role, id="*", incarnation="*")
-        arrivals = Arrivals(_TOKEN_BUFFER)
+        arrivals = zenoh_intake.Arrivals(_TOKEN_BUFFER)
         subscriber = self._session.liveliness().declare_subscriber(
             patterned(f"{self._namespace}/{key}"), _into(arrivals), history=True
         )
@@ -455,7 +446,7 @@ class ZenohBus:
         def arrive(event: Any) -> None:
             post(LinkChanged(up=event.kind == zenoh.SampleKind.PUT))
 
-        arrivals = Arrivals(_TOKEN_BUFFER)
+        arrivals = zenoh_intake.Arrivals(_TOKEN_BUFFER)
         listener = self._session.info.declare_transport_events_listener(_into(arrivals), history=False)
         self._read(listener, arrive, "links", arrivals.take)
 
@@ -511,6 +502,6 @@ class ZenohBus:
         self._threads.append(thread)
 
 
-def _into(arrivals: Arrivals) -> Any:
+def _into(arrivals: zenoh_intake.Arrivals) -> Any:
     """Returns the handler with which an entity is declared, which leaves its items there."""
     return zenoh.handlers.Callback(arrivals.put, arrivals.end, indirect=False)

@@ -15,26 +15,10 @@ from typing import Any
 
 import zenoh
 
-from swarm.bus.bus import (
-    LONGEST_TIMEOUT_S,
-    TIMEOUT_PARAMETER,
-    USUAL_TIMEOUT_S,
-    Heard,
-    counter_of,
-    new_counts,
-    newest_of,
-)
+from swarm.bus import bus
 from swarm.errors import ProtocolError
+from swarm.wire import codec
 from swarm.wire.access import Act, Authenticator, check_code
-from swarm.wire.codec import (
-    JSON_ENCODING,
-    KEY_FIELD,
-    decode,
-    decode_many,
-    decode_parameters,
-    may_be_json,
-    packed_json,
-)
 from swarm.wire.meant_key import SHARED, check_meant, check_named
 from swarm.wire.messages import Message
 from swarm.wire.topics import Topic, check_size
@@ -142,20 +126,20 @@ def guarded(callback: Callable[..., None]) -> Callable[..., None]:
 def is_json(carrier: Any, payload: bytes) -> bool:
     """Returns True if the encoding of a sample or query is JSON. The lookup costs more than reading the first
     byte."""
-    return may_be_json(payload) and str(carrier.encoding).partition(";")[0] == JSON_ENCODING
+    return codec.may_be_json(payload) and str(carrier.encoding).partition(";")[0] == codec.JSON_ENCODING
 
 
 def timeout_of(stated: str) -> float:
     """The timeout that a query states, within bounds. Raises ProtocolError if it is not a positive number."""
     if not stated:
-        return USUAL_TIMEOUT_S
+        return bus.USUAL_TIMEOUT_S
     try:
         timeout_s = float(stated)
     except ValueError:
         timeout_s = 0.0
     if not timeout_s > 0:  # neither is NaN
-        raise ProtocolError(f"{TIMEOUT_PARAMETER} {stated[:40]!r} is not a positive number of seconds")
-    return min(timeout_s, LONGEST_TIMEOUT_S)
+        raise ProtocolError(f"{bus.TIMEOUT_PARAMETER} {stated[:40]!r} is not a positive number of seconds")
+    return min(timeout_s, bus.LONGEST_TIMEOUT_S)
 
 
 log = logging.getLogger(__name__)
@@ -175,29 +159,29 @@ class Intake:
     def __init__(self, namespace: str, authenticator: Authenticator | None) -> None:
         self._namespace, self._start = namespace, f"{namespace}/"
         self.authenticator = authenticator
-        self.counts = new_counts()
+        self.counts = bus.new_counts()
         self._counting = threading.Lock()
         """Held to add to `counts`."""
         self._logged_s: dict[tuple[str, str], float] = {}
         """Topic and counter -> when such a dropped payload was last logged, by the monotonic clock."""
 
-    def _event_of(self, topic: Topic, key: str, sample: zenoh.Sample, payload: bytes) -> Heard | None:
+    def _event_of(self, topic: Topic, key: str, sample: zenoh.Sample, payload: bytes) -> bus.Heard | None:
         """The event of a sample; None, counted and logged, if it is rejected."""
         try:
             named = self.fields(topic, key)
             packed = self._checked(topic, key, sample, payload)
-            message = decode(packed, topic.message)
+            message = codec.decode(packed, topic.message)
             topic.check_key(named, message)
         except ProtocolError as error:
             self.drop(topic.name, key, error)
             return None
-        return Heard(topic, named, message)
+        return bus.Heard(topic, named, message)
 
     def together(self, topic: Topic, samples: list[zenoh.Sample]) -> list[tuple[str, Message]]:
         """Keys below the namespace and messages of samples, without those that are rejected."""
         keyed = list(self._packed(topic, samples))
         keys = [key for key, _ in keyed]
-        decoded = decode_many([payload for _, payload in keyed], topic.message)
+        decoded = codec.decode_many([payload for _, payload in keyed], topic.message)
         accepted: list[tuple[str, Message]] = []
         for key, message in zip(keys, decoded, strict=True):
             if isinstance(message, ProtocolError):
@@ -206,10 +190,10 @@ class Intake:
                 accepted.append((self.below(key), message))
         return accepted
 
-    def newest(self, topic: Topic, samples: list[zenoh.Sample]) -> list[Heard]:
+    def newest(self, topic: Topic, samples: list[zenoh.Sample]) -> list[bus.Heard]:
         """The events of the newest sample under each key, without those that are rejected."""
         keyed = ((each[0], each) for each in self._own(samples))
-        return newest_of(topic, keyed, lambda waited: self._event_of(topic, *waited))
+        return bus.newest_of(topic, keyed, lambda waited: self._event_of(topic, *waited))
 
     def _own(self, samples: list[zenoh.Sample]) -> list[tuple[str, zenoh.Sample, bytes]]:
         """Keys, samples and payloads of those in our namespace: `patterned` hears others, too."""
@@ -240,20 +224,20 @@ class Intake:
         assert wanted is not None
         check_size(asked, topic.ask_bytes)
         if query.payload is None:
-            check_named(self.below(key), parameters.pop(KEY_FIELD, None))
+            check_named(self.below(key), parameters.pop(codec.KEY_FIELD, None))
             self.check(topic, "ask", key, query, asked)
-            return decode_parameters(parameters, wanted)
-        packed = packed_json(asked, wanted) if is_json(query, asked) else asked
+            return codec.decode_parameters(parameters, wanted)
+        packed = codec.packed_json(asked, wanted) if is_json(query, asked) else asked
         check_meant(self.below(key), packed)
         self.check(topic, "ask", key, query, asked)
-        return decode(packed, wanted)
+        return codec.decode(packed, wanted)
 
     def _checked(self, topic: Topic, key: str, sample: zenoh.Sample, payload: bytes) -> bytes:
         """A payload as MessagePack, which is short enough, is meant for its key and has the code that its topic
         needs. Raises ProtocolError."""
         check_size(payload, topic.put_bytes)
         in_json = is_json(sample, payload)
-        packed = packed_json(payload, topic.message, self.fields(topic, key)) if in_json else payload
+        packed = codec.packed_json(payload, topic.message, self.fields(topic, key)) if in_json else payload
         check_meant(self.below(key), packed, must=in_json and topic.message in SHARED)
         self.check(topic, "put", key, sample, payload)
         return packed
@@ -294,7 +278,7 @@ class Intake:
 
         name  of the topic, or what else it belongs to
         """
-        kind, now_s = (name, counter_of(error)), time.monotonic()
+        kind, now_s = (name, bus.counter_of(error)), time.monotonic()
         with self._counting:
             self.counts[kind[1]] += 1
         if now_s - self._logged_s.get(kind, -_LOG_AGAIN_S) >= _LOG_AGAIN_S:

@@ -16,24 +16,7 @@ from swarm.clock import NS_PER_S
 from swarm.config.agent_plan import agent_of
 from swarm.errors import ConfigError
 from swarm.grid import TILE_CELLS, GridSpec
-from swarm.wire.messages.map_data import (
-    FOREVER,
-    PACE_LEAST,
-    PACE_MOST,
-    SEQ_STEP,
-    Digest,
-    MarkKind,
-    MarkSet,
-    MarksRequest,
-)
-from swarm.wire.messages.planning import (
-    GROUND,
-    PlaceRouteReply,
-    PlaceRouteRequest,
-    PushedRoute,
-    RouteReply,
-    RouteRequest,
-)
+from swarm.wire.messages import map_data, planning
 from swarm.wire.messages.vehicles import LONGEST_OBSTACLE_LEASE_S, MOST_M_PER_S, MOST_RADIUS_M, Obstacle
 from swarm.wire.topics import DIGEST, MARKS, OBSTACLE, PLACE_ROUTE, PUSHED_ROUTE, asker_of
 
@@ -42,7 +25,7 @@ if TYPE_CHECKING:
 
 
 class _Statement(NamedTuple):
-    kind: MarkKind
+    kind: map_data.MarkKind
     pace_s_per_m: float
     stamp_ns: int
     until_ns: int
@@ -61,7 +44,7 @@ class OwnMarks:
         self._grid = grid
         self._tiles: dict[int, dict[int, _Statement]] = {}
         """Tile -> cell in it -> its last mark."""
-        self._sets: dict[int, MarkSet] = {}
+        self._sets: dict[int, map_data.MarkSet] = {}
         """Tile -> its newest set."""
         self._stamp_ns = 0
         """Timestamp of the newest mark: no later mark is older, even if the clock is set back."""
@@ -75,12 +58,12 @@ class OwnMarks:
     def state(
         self,
         cells: Iterable[int],
-        kind: MarkKind,
+        kind: map_data.MarkKind,
         pace_s_per_m: float,
         now_ns: int,
-        until_ns: int = FOREVER,
+        until_ns: int = map_data.FOREVER,
         class_number: int = 0,
-    ) -> list[MarkSet]:
+    ) -> list[map_data.MarkSet]:
         """Makes one statement about all these cells of the grid. Returns the sets to put.
 
         class_number  for whom: 0 is all vehicles, a class of the scenario counts from 1 on
@@ -95,44 +78,44 @@ class OwnMarks:
             self._tiles.setdefault(tile, {})[row % TILE_CELLS * TILE_CELLS + col % TILE_CELLS] = statement
         return [self._set(tile, now_ns) for tile in changed]
 
-    def overruled(self, other: MarkSet, now_ns: int) -> list[MarkSet]:
+    def overruled(self, other: map_data.MarkSet, now_ns: int) -> list[map_data.MarkSet]:
         """A set under our name. If a keeper took us for dead and shortened ours, the set to put in its place."""
         mine = self._sets.get(other.tile)
         if mine is None or (other.epoch, other.seq) <= (mine.epoch, mine.seq) or other.epoch + 1 >= 1 << 62:
             return []
         return [self._set(other.tile, now_ns, epoch=other.epoch + 1)]
 
-    def answer(self, request: MarksRequest) -> list[MarkSet]:
+    def answer(self, request: map_data.MarksRequest) -> list[map_data.MarkSet]:
         """Returns the requested mark sets."""
         if request.authors and self.author not in request.authors:
             return []
         return [each for tile, each in self._sets.items() if not request.tiles or tile in request.tiles]
 
-    def digest(self) -> Digest:
+    def digest(self) -> map_data.Digest:
         """Digest of the sets, by which others find those that they lack."""
         self._digests += 1
         rows = b"".join(
             struct.pack("<IQQ", tile, each.epoch, each.seq) for tile, each in sorted(self._sets.items())
         )
-        return Digest(author=self.author, role="rover", held={self.author: rows}, seq=self._digests)
+        return map_data.Digest(author=self.author, role="rover", held={self.author: rows}, seq=self._digests)
 
-    def region_of(self, of: MarkSet) -> int:
+    def region_of(self, of: map_data.MarkSet) -> int:
         return self._grid.region_of_tile(self._grid.class_of_tile(of.tile)[1])
 
-    def _set(self, tile: int, now_ns: int, epoch: int | None = None) -> MarkSet:
+    def _set(self, tile: int, now_ns: int, epoch: int | None = None) -> map_data.MarkSet:
         stated = self._tiles[tile]
         for cell in [cell for cell, each in stated.items() if each.until_ns <= now_ns]:
             del stated[cell]
         before = self._sets.get(tile)
         rows = sorted(stated.items())
         many = len(rows)
-        ends = any(each.until_ns != FOREVER for each in stated.values())
-        made = self._sets[tile] = MarkSet(
+        ends = any(each.until_ns != map_data.FOREVER for each in stated.values())
+        made = self._sets[tile] = map_data.MarkSet(
             author=self.author,
             group=self._group,
             tile=tile,
             epoch=epoch if epoch is not None else 1 if before is None else before.epoch,
-            seq=0 if before is None else before.seq + SEQ_STEP,
+            seq=0 if before is None else before.seq + map_data.SEQ_STEP,
             cells=struct.pack(f"<{many}H", *(cell for cell, _ in rows)),
             kinds=bytes(each.kind for _, each in rows),
             paces=struct.pack(f"<{many}f", *(each.pace_s_per_m for _, each in rows)),
@@ -173,7 +156,7 @@ class Vehicle(Reported):
         group: str,
         radius_m: float,
         lease_s: float,
-        vehicle_class: str = GROUND,
+        vehicle_class: str = planning.GROUND,
     ) -> None:
         session.check_ids(id=id, group=group, vehicle_class=vehicle_class)
         if agent_of(id) != id:
@@ -331,10 +314,10 @@ class Vehicle(Reported):
             "vehicle_class": self.vehicle_class,
         }
         if self._goal is None:
-            request = RouteRequest(force=ran_out, **from_here)
+            request = planning.RouteRequest(force=ran_out, **from_here)
             asked = self._session.ask_planner(request, _TIMEOUT_S, target, self.id)
         else:
-            place = PlaceRouteRequest(to=self._goal, **from_here)
+            place = planning.PlaceRouteRequest(to=self._goal, **from_here)
             asked = self._session.ask(PLACE_ROUTE, place, _TIMEOUT_S, asker=asker_of("rover", self.id))
         self._asking = target
 
@@ -351,10 +334,10 @@ class Vehicle(Reported):
 
         asked.add_done_callback(finish)
 
-    def _take(self, reply: RouteReply | PlaceRouteReply | PushedRoute) -> None:
+    def _take(self, reply: planning.RouteReply | planning.PlaceRouteReply | planning.PushedRoute) -> None:
         """Takes a received route, and reports it if it differs from the last one."""
         try:
-            given = reply.route if isinstance(reply, PushedRoute) else reply.routes[0]
+            given = reply.route if isinstance(reply, planning.PushedRoute) else reply.routes[0]
             route = Route.of(self._session.frame, given, reply)
         except (ValueError, IndexError) as error:
             self._session.problem("routes_refused", f"the planner of {self._target} answers nonsense: {error}")
@@ -397,11 +380,11 @@ class Vehicle(Reported):
         if (lethal, pace_s_per_m is not None, clear).count(True) != 1:
             raise session.refused("mark states one thing: lethal=True, pace_s_per_m=... or clear=True")
         if pace_s_per_m is not None:
-            pace_s_per_m = session.number("pace_s_per_m", pace_s_per_m, PACE_LEAST, PACE_MOST)
+            pace_s_per_m = session.number("pace_s_per_m", pace_s_per_m, map_data.PACE_LEAST, map_data.PACE_MOST)
         if for_s is not None:
             for_s = session.number("for_s", for_s, 0, 1e9, more=True)
         class_number = 0 if only_for is None else session.class_number(only_for, "only_for")
-        kind = MarkKind.LETHAL if lethal else MarkKind.CLEAR if clear else MarkKind.PACE
+        kind = map_data.MarkKind.LETHAL if lethal else map_data.MarkKind.CLEAR if clear else map_data.MarkKind.PACE
         if not self._marks.any:
             session.trust()  # which asks the network: others wait for the lock meanwhile
         with session.lock:
@@ -413,7 +396,7 @@ class Vehicle(Reported):
             if not once:
                 return 0
             now_ns = session.swarm_now_ns()
-            until_ns = FOREVER if for_s is None else now_ns + int(for_s * NS_PER_S)
+            until_ns = map_data.FOREVER if for_s is None else now_ns + int(for_s * NS_PER_S)
             if not self._marks.any:
                 session.bus.serve(MARKS, session.post, author=self._marks.author)
                 session.bus.subscribe(MARKS, session.post, author=self._marks.author)
@@ -422,12 +405,12 @@ class Vehicle(Reported):
             self._digest_due_ns = 0
         return len(once)
 
-    def _put_marks(self, sets: Iterable[MarkSet]) -> None:
+    def _put_marks(self, sets: Iterable[map_data.MarkSet]) -> None:
         for each in sets:
             region = self._marks.region_of(each)
             self._session.bus.publish(MARKS, each, region=region, tile=each.tile, author=each.author)
 
-    def _answer_marks(self, asked: Asked, request: MarksRequest) -> None:
+    def _answer_marks(self, asked: Asked, request: map_data.MarksRequest) -> None:
         for each in self._marks.answer(request):
             asked.answer(each, region=self._marks.region_of(each), tile=each.tile, author=each.author)
         asked.end()
@@ -440,15 +423,15 @@ class Vehicle(Reported):
                 obstacle.id == self.id and obstacle.incarnation != self.incarnation
             ):
                 self._on_double(obstacle)
-            case Heard(message=PushedRoute() as pushed) if pushed.vehicle == self.id and (
+            case Heard(message=planning.PushedRoute() as pushed) if pushed.vehicle == self.id and (
                 pushed.target_cell == self._goal if pushed.target is None else pushed.target == self._target
             ):
                 self._take(pushed)
-            case Heard(message=MarkSet() as marks) if marks.author == self._marks.author:
+            case Heard(message=map_data.MarkSet() as marks) if marks.author == self._marks.author:
                 self._put_marks(self._marks.overruled(marks, self._session.swarm_now_ns()))
-            case Asked(topic=topic, request=MarksRequest() as request, fields=fields) if topic is MARKS and fields[
-                "author"
-            ] in ("*", self._marks.author):
+            case Asked(topic=topic, request=map_data.MarksRequest() as request, fields=fields) if (
+                topic is MARKS and fields["author"] in ("*", self._marks.author)
+            ):
                 self._answer_marks(event, request)
             case LinkChanged(up=True):
                 self._repeat_due_ns = self._ask_due_ns = self._digest_due_ns = 0

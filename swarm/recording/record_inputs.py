@@ -15,21 +15,7 @@ from swarm.bus.bus import Asked, Event, Post, WorkDone, Worker
 from swarm.clock import NS_PER_S
 from swarm.config.write import scenario_text
 from swarm.errors import StoreError
-from swarm.recording.recording_file import (
-    FOLDER,
-    SUFFIX,
-    Call,
-    Called,
-    Ended,
-    Head,
-    JobDone,
-    LoopCounters,
-    Output,
-    Outputs,
-    Read,
-    RecordWriter,
-    record_of,
-)
+from swarm.recording import recording_file
 from swarm.recording.service_boundary import Boundary, Crossing, content_of, pack
 from swarm.runtime.process import Service
 from swarm.runtime.role_setup import RoleSetup
@@ -68,7 +54,7 @@ def versions() -> dict[str, str]:
 
 def path_of(folder: Path, role: str, id: str, incarnation: int) -> Path:
     """Returns the file of the recording of one process, below a run's folder."""
-    return folder / FOLDER / f"{role}-{id}.{incarnation}{SUFFIX}"
+    return folder / recording_file.FOLDER / f"{role}-{id}.{incarnation}{recording_file.SUFFIX}"
 
 
 class Recording(Crossing):
@@ -80,14 +66,14 @@ class Recording(Crossing):
 
     def __init__(self, setup: RoleSetup, terrain: str, folder: Path) -> None:
         super().__init__()
-        self._writer = RecordWriter(path_of(folder, setup.role, setup.id, setup.incarnation))
-        self._outputs: list[Output] = []
+        self._writer = recording_file.RecordWriter(path_of(folder, setup.role, setup.id, setup.incarnation))
+        self._outputs: list[recording_file.Output] = []
         self._jobs = 0
         self._job = threading.local()
         """State of the thread that runs a job: `reads`, its readings."""
         self._flush_due_ns = 0
         self._writer.write(
-            Head(
+            recording_file.Head(
                 role=setup.role,
                 id=setup.id,
                 run_id=setup.run_id,
@@ -129,11 +115,11 @@ class Recording(Crossing):
             reads.append((what, content))
             return
         self._let_go()  # what left before it, in order
-        self._writer.write(Read(what, content))
+        self._writer.write(recording_file.Read(what, content))
 
     def let_out(self, to: str, content: bytes, what: object = None) -> None:
         if getattr(self._job, "reads", None) is None:  # what a job lets out shows in what it returns
-            self._outputs.append(Output(to, len(content), digest_of(content)))
+            self._outputs.append(recording_file.Output(to, len(content), digest_of(content)))
 
     def submit(self, worker: Worker, tag: str, job: Callable[[], object], post: Post, model_ns: int) -> None:
         number, reads = self._jobs, list[tuple[str, bytes]]()
@@ -148,14 +134,14 @@ class Recording(Crossing):
 
         def done(event: Event) -> None:
             assert isinstance(event, WorkDone)
-            post(JobDone(event.tag, event.result, event.took_ns, number, reads))
+            post(recording_file.JobDone(event.tag, event.result, event.took_ns, number, reads))
 
         worker.submit(tag, run, done, model_ns)
 
     # --- calls of the service -------------------------------------------------------------------------------
 
     @contextmanager
-    def call(self, record: Call) -> Iterator[None]:
+    def call(self, record: recording_file.Call) -> Iterator[None]:
         """Around one call of the service."""
         self._let_go()  # of what made it
         self._writer.write(record)
@@ -173,13 +159,13 @@ class Recording(Crossing):
 
     def _let_go(self) -> None:
         if self._outputs:
-            self._writer.write(Outputs(self._outputs))
+            self._writer.write(recording_file.Outputs(self._outputs))
             self._outputs = []
 
     def close(self, *, ended: bool) -> None:
         """No more is recorded. `ended`: the process ended in order."""
         if ended:
-            self._writer.write(Ended())
+            self._writer.write(recording_file.Ended())
         self._writer.close()
 
 
@@ -189,7 +175,7 @@ class _RecordedService:
     def __init__(self, service: Service, recording: Recording) -> None:
         self._service = service
         self._recording = recording
-        self._counters = LoopCounters(service.counters)
+        self._counters = recording_file.LoopCounters(service.counters)
 
     @property
     def counters(self) -> Counters:
@@ -199,22 +185,22 @@ class _RecordedService:
         return self._service.lacks()
 
     def start(self, now_ns: int) -> None:
-        with self._recording.call(Called(now_ns, "start", self._counters.changed())):
+        with self._recording.call(recording_file.Called(now_ns, "start", self._counters.changed())):
             self._service.start(now_ns)
 
     def handle(self, event: Event, now_ns: int) -> None:
-        record = record_of(event, now_ns)
+        record = recording_file.record_of(event, now_ns)
         if isinstance(event, Asked):
             event = self._recording.asked(event)
         with self._recording.call(record):
             self._service.handle(event, now_ns)
 
     def tick(self, now_ns: int) -> None:
-        with self._recording.call(Called(now_ns, "tick", self._counters.changed())):
+        with self._recording.call(recording_file.Called(now_ns, "tick", self._counters.changed())):
             self._service.tick(now_ns)
 
     def stop(self, now_ns: int) -> None:
-        with self._recording.call(Called(now_ns, "stop", self._counters.changed())):
+        with self._recording.call(recording_file.Called(now_ns, "stop", self._counters.changed())):
             self._service.stop(now_ns)
 
 

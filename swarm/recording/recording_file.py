@@ -23,19 +23,7 @@ from typing import Annotated, Any, BinaryIO, Literal
 
 import msgspec
 
-from swarm.bus.bus import (
-    Answerer,
-    Appeared,
-    Asked,
-    AskEnded,
-    Disappeared,
-    Event,
-    Heard,
-    HeardMany,
-    LinkChanged,
-    Replied,
-    WorkDone,
-)
+from swarm.bus import bus
 from swarm.config.agent_plan import AddedAgent
 from swarm.config.input_files import FileKind, check_bytes
 from swarm.errors import ProtocolError, StoreError
@@ -339,31 +327,31 @@ _REST: dict[str, Any] = {
 
 
 @dataclass(frozen=True, slots=True, eq=False)
-class JobDone(WorkDone):
+class JobDone(bus.WorkDone):
     """number  of the job among those that were submitted, from 0; reads  what it read of the outside"""
 
     number: int
     reads: Sequence[tuple[str, bytes]]
 
 
-def record_of(event: Event, now_ns: int) -> Handled:
+def record_of(event: bus.Event, now_ns: int) -> Handled:
     """The record of an event that is handled now."""
     samples: list[tuple[str, bytes]] = []
     rest: tuple[Any, ...] = ()
     match event:
-        case Heard(message=message):
+        case bus.Heard(message=message):
             samples = [("", content_of(message))]
-        case HeardMany(samples=many):
+        case bus.HeardMany(samples=many):
             samples = [(key, content_of(message)) for key, message in many]
-        case Asked(request=message):
+        case bus.Asked(request=message):
             samples, rest = [("", content_of(message))], (event.timeout_s,)
-        case Replied(message=message):
+        case bus.Replied(message=message):
             samples, rest = [("", content_of(message))], (event.tag, event.took_s)
-        case AskEnded():
+        case bus.AskEnded():
             rest = (event.tag, event.replies, event.failure)
-        case Appeared(peer) | Disappeared(peer):
+        case bus.Appeared(peer) | bus.Disappeared(peer):
             rest = (peer.role, peer.id, peer.incarnation)
-        case LinkChanged():
+        case bus.LinkChanged():
             rest = (event.up, event.beyond)
         case JobDone():
             rest = (event.tag, event.number, event.took_ns, list(event.reads))
@@ -383,7 +371,7 @@ def rest_of(record: Handled) -> Any:
         raise StoreError(f"a record that is no event: {error}") from error
 
 
-def event_of(record: Handled, answerer: Answerer) -> Event:
+def event_of(record: Handled, answerer: bus.Answerer) -> bus.Event:
     """The event in a record, but for jobs. Raises StoreError on one that cannot have been an event.
 
     answerer  receives the replies to the query
@@ -391,11 +379,11 @@ def event_of(record: Handled, answerer: Answerer) -> Event:
     rest = rest_of(record)
     match record.kind:
         case "Appeared":
-            return Appeared(Peer(*rest))
+            return bus.Appeared(Peer(*rest))
         case "Disappeared":
-            return Disappeared(Peer(*rest))
+            return bus.Disappeared(Peer(*rest))
         case "LinkChanged":
-            return LinkChanged(*rest)
+            return bus.LinkChanged(*rest)
     if record.topic not in _TOPICS:
         raise StoreError(f"this build has no topic {record.topic!r}")
     topic = _TOPICS[record.topic]
@@ -406,22 +394,22 @@ def event_of(record: Handled, answerer: Answerer) -> Event:
     try:
         match record.kind, payloads:
             case "Heard", [payload]:
-                return Heard(topic, fields, decode(payload, topic.message))
+                return bus.Heard(topic, fields, decode(payload, topic.message))
             case "Asked", [payload] if topic.request is not None:
-                return Asked(topic, fields, decode(payload, topic.request), answerer)
+                return bus.Asked(topic, fields, decode(payload, topic.request), answerer)
             case "Replied", [payload]:
                 tag, took_s = rest
-                return Replied(tag, topic, fields, decode_either(payload, topic.message, topic.bulk), took_s)
+                return bus.Replied(tag, topic, fields, decode_either(payload, topic.message, topic.bulk), took_s)
             case "AskEnded", _:
                 tag, replies, failure = rest
-                return AskEnded(tag, topic, replies, failure)
+                return bus.AskEnded(tag, topic, replies, failure)
             case "HeardMany", _:
                 samples = []
                 for (key, _), message in zip(record.samples, decode_many(payloads, topic.message), strict=True):
                     if isinstance(message, ProtocolError):
                         raise message
                     samples.append((key, message))
-                return HeardMany(topic, samples)
+                return bus.HeardMany(topic, samples)
     except ProtocolError as error:
         raise StoreError(f"a recorded message is none to this build: {error}") from error
     raise StoreError(f"a record of {record.kind} on topic {topic.name} that is no event")

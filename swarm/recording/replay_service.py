@@ -11,21 +11,8 @@ from typing import Any, TypeVar, cast
 from swarm.bus.bus import Answerer, Asked, Event, Heard, Post, WorkDone, Worker
 from swarm.clock import NS_PER_S
 from swarm.errors import StoreError
+from swarm.recording import recording_file
 from swarm.recording.record_inputs import FAILED, RAISED, digest_of, raised_as
-from swarm.recording.recording_file import (
-    Call,
-    Called,
-    Cut,
-    Ended,
-    Handled,
-    Output,
-    Outputs,
-    Read,
-    RecordReader,
-    event_of,
-    rest_of,
-    set_figures,
-)
 from swarm.recording.service_boundary import Crossing, unpack
 from swarm.runtime.process import Service, collected_rarely
 
@@ -75,9 +62,9 @@ class Outcome:
 class _Step:
     """One call of the service, with all that it read and let out; without a call: its making."""
 
-    call: Call | None
+    call: recording_file.Call | None
     reads: deque[tuple[str, bytes]] = field(default_factory=deque)
-    outputs: list[Output] = field(default_factory=list)
+    outputs: list[recording_file.Output] = field(default_factory=list)
 
 
 class _NotRecorded(BaseException):
@@ -87,7 +74,7 @@ class _NotRecorded(BaseException):
 
 @dataclass(frozen=True, slots=True)
 class _LetOut:
-    output: Output
+    output: recording_file.Output
     what: object
 
 
@@ -123,7 +110,7 @@ class Replaying(Crossing):
 
     def let_out(self, to: str, content: bytes, what: object = None) -> None:
         if not self._in_job:
-            self.outputs.append(_LetOut(Output(to, len(content), digest_of(content)), what))
+            self.outputs.append(_LetOut(recording_file.Output(to, len(content), digest_of(content)), what))
 
     def raised(self, error: BaseException) -> None:
         self.let_out(raised_as(error), b"")
@@ -134,11 +121,11 @@ class Replaying(Crossing):
 
     # --- events ---------------------------------------------------------------------------------------------
 
-    def event_of(self, record: Handled) -> Event:
+    def event_of(self, record: recording_file.Handled) -> Event:
         """The event in a record. A job that has ended is run now, with what it read then."""
         if record.kind == "JobDone":
-            return self._job_done(*rest_of(record))
-        event = event_of(record, _nobody_asks)
+            return self._job_done(*recording_file.rest_of(record))
+        event = recording_file.event_of(record, _nobody_asks)
         if isinstance(event, Asked):
             (timeout_s,) = record.rest
             return self.asked(replace(event, answerer=cast(Answerer, _Nobody(timeout_s=timeout_s))))
@@ -158,7 +145,7 @@ class Replaying(Crossing):
 
 
 def replay(
-    reader: RecordReader,
+    reader: recording_file.RecordReader,
     make: Callable[[Replaying], Service],
     namespace: str,
     until_s: float | None = None,
@@ -175,7 +162,7 @@ def replay(
 class _Replay:
     """A replay under way: see `replay`."""
 
-    reader: RecordReader
+    reader: recording_file.RecordReader
     make: Callable[[Replaying], Service]
     boundary: Replaying
     until_s: float | None
@@ -207,21 +194,21 @@ class _Replay:
         step = _Step(None)
         until_ns = None if self.until_s is None else self.reader.head.started_ns + int(self.until_s * NS_PER_S)
         for record in self.reader:
-            if isinstance(record, Read):
+            if isinstance(record, recording_file.Read):
                 step.reads.append((record.what, record.value))
-            elif isinstance(record, Outputs):
+            elif isinstance(record, recording_file.Outputs):
                 step.outputs += record.outputs
-            elif isinstance(record, Called | Handled):
+            elif isinstance(record, recording_file.Called | recording_file.Handled):
                 yield step
                 if until_ns is not None and record.now_ns > until_ns:
                     self.ended = f"replayed until {self.until_s:g} s"
                     return
                 step = _Step(record)
-            elif isinstance(record, Ended):
+            elif isinstance(record, recording_file.Ended):
                 yield step
                 self.ended = "ended as asked"
                 return
-            elif isinstance(record, Cut):
+            elif isinstance(record, recording_file.Cut):
                 self.ended = record.why
                 return
             else:
@@ -251,19 +238,19 @@ class _Replay:
                 return self._difference(step, recorded, stray if replayed is None else _described_output(replayed))
         return None if stray is None else self._difference(step, None, stray)
 
-    def _call(self, call: Call | None) -> None:
+    def _call(self, call: recording_file.Call | None) -> None:
         if call is None:
             self.service = self.make(self.boundary)
             return
         service = self.service
         assert service is not None
-        if isinstance(call, Handled):
+        if isinstance(call, recording_file.Handled):
             service.handle(self.boundary.event_of(call), call.now_ns)
         else:
-            set_figures(service.counters, call.figures)
+            recording_file.set_figures(service.counters, call.figures)
             getattr(service, call.method)(call.now_ns)
 
-    def _difference(self, step: _Step, recorded: Output | None, replayed: str | None) -> Difference:
+    def _difference(self, step: _Step, recorded: recording_file.Output | None, replayed: str | None) -> Difference:
         return Difference(
             event=self.events + (step.call is not None),
             what=MAKING if step.call is None else described(step.call),
@@ -273,14 +260,14 @@ class _Replay:
         )
 
 
-def described(call: Call) -> str:
+def described(call: recording_file.Call) -> str:
     """An event in a few words."""
-    if isinstance(call, Called):
+    if isinstance(call, recording_file.Called):
         return call.method
     if call.kind == "JobDone":
-        tag, number, *_ = rest_of(call)
+        tag, number, *_ = recording_file.rest_of(call)
         return f"end of job {number} {tag}"
-    match event_of(call, _nobody_asks):
+    match recording_file.event_of(call, _nobody_asks):
         case Heard(topic=topic, fields=fields):
             return topic.below(fields)
         case Asked(topic=topic, fields=fields):
@@ -292,7 +279,7 @@ def _was_raised(step: _Step) -> bool:
     return any(output.to.startswith(RAISED) for output in step.outputs)
 
 
-def _named(output: Output) -> str:
+def _named(output: recording_file.Output) -> str:
     if not output.length:
         return output.to
     return f"{output.to} ({output.length} bytes, digest {output.digest.hex()})"

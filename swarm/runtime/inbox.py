@@ -9,16 +9,7 @@ from dataclasses import dataclass, field
 from heapq import heapify, heappop, heappush
 from typing import Generic, TypeVar
 
-from swarm.bus.bus import (
-    QUESTION_BYTES,
-    QUESTION_COST_BYTES,
-    Asked,
-    Event,
-    Heard,
-    HeardMany,
-    Question,
-    Undecoded,
-)
+from swarm.bus import bus
 from swarm.wire.topics import is_own
 
 T = TypeVar("T")
@@ -160,7 +151,7 @@ class FairQueue(Generic[T]):
 
 CAPACITY = 4096
 """Unread samples per topic: more than a process gets in a second. Beyond it the oldest goes."""
-PER_ASKER_BYTES = QUESTION_BYTES // 4
+PER_ASKER_BYTES = bus.QUESTION_BYTES // 4
 """Bytes of unread questions per asker, or per topic where the key names no asker."""
 LATE_S = 0.5
 """Once the oldest question of an asker has waited this long, or half of its asker's timeout, the newest is taken
@@ -175,7 +166,7 @@ _ASKED = "?"
 _NAMELESS = "?"
 """Asker of all questions of costly topics that name none."""
 
-_Queue = OrderedDict[Hashable, tuple[int, Event | BaseException]]
+_Queue = OrderedDict[Hashable, tuple[int, bus.Event | BaseException]]
 """Key -> (number, event), in the order of arrival. The key is the number, or the key of which only the newest event
 is kept."""
 
@@ -214,7 +205,7 @@ class Inbox:
         """Set by `close`, for good."""
         self._queues: OrderedDict[str, _Queue] = OrderedDict()
         """Unread events by kind and topic. The queue whose turn was longest ago comes first."""
-        self._asked: FairQueue[tuple[int, Question]] = FairQueue(QUESTION_BYTES, PER_ASKER_BYTES)
+        self._asked: FairQueue[tuple[int, bus.Question]] = FairQueue(bus.QUESTION_BYTES, PER_ASKER_BYTES)
         """Unread questions. The queue `_ASKED` stands for them in the order of turns, and is empty."""
         self._unread = 0
         """Events in all queues."""
@@ -226,19 +217,19 @@ class Inbox:
         """Since the start: samples and questions dropped to make room for newer ones; questions whose asker left
         before their turn came."""
 
-    def post(self, event: Event) -> None:
+    def post(self, event: bus.Event) -> None:
         """Adds an event, from any thread.
 
         With a `HeardMany` it blocks the caller while more than two batches are unread. The bus then drops its
         oldest samples instead of this inbox growing.
         """
-        if isinstance(event, Heard):
+        if isinstance(event, bus.Heard):
             newest = tuple(event.fields.values()) if event.topic.newest else None
             self._put(event, event.topic.name, newest)
-        elif isinstance(event, Question):
+        elif isinstance(event, bus.Question):
             for dropped in self._put_question(event):
                 _refuse(dropped, f"too many questions wait{f' of {dropped.asker}' if dropped.asker else ''}")
-        elif isinstance(event, HeardMany):
+        elif isinstance(event, bus.HeardMany):
             with self._lock:
                 self._unread_batches += 1
                 self._put(event, _KEPT)
@@ -254,7 +245,7 @@ class Inbox:
         """Makes the owner raise: how another thread ends its process."""
         self._put(error, _KEPT)
 
-    def _put(self, event: Event | BaseException, name: str, newest: Hashable | None = None) -> None:
+    def _put(self, event: bus.Event | BaseException, name: str, newest: Hashable | None = None) -> None:
         """Adds an event to the queue `name`; if that is full, its oldest event is dropped.
 
         newest  key under which only the newest event is kept: it replaces an unread one with the same key. None:
@@ -277,7 +268,7 @@ class Inbox:
             queue[self._next if newest is None else newest] = (self._next, event)
             self._ring()
 
-    def _put_question(self, question: Question) -> list[Question]:
+    def _put_question(self, question: bus.Question) -> list[bus.Question]:
         """Adds a question. Returns the questions which were dropped to make room."""
         costly = question.topic.costly
         asker = question.asker or (_NAMELESS if costly else f"{_NAMELESS}{question.topic.name}")
@@ -285,14 +276,14 @@ class Inbox:
         with self._lock:
             self._next += 1
             self._queues.setdefault(_ASKED, OrderedDict())
-            price = QUESTION_COST_BYTES + question.size
+            price = bus.QUESTION_COST_BYTES + question.size
             dropped = self._asked.put(asker, (self._next, question), price=price, rank=rank)
             self._unread += 1 - len(dropped)
             self.counts["events_dropped"] += len(dropped)
             self._ring()
         return [each for _, each in dropped]
 
-    def take(self, timeout_s: float) -> Event | None:
+    def take(self, timeout_s: float) -> bus.Event | None:
         """The next event; None if there is none within the timeout, or if it is a question that is rejected. Raises
         the error that `fail` was given, in its turn. Called by the owner only."""
         with self._lock:
@@ -303,20 +294,20 @@ class Inbox:
                 if not self._asleep:  # a poster released the bell between the timeout and this line
                     self._bell.acquire()
                 self._asleep = False
-        expired: list[Question] = []
+        expired: list[bus.Question] = []
         with self._lock:
             event = self._pop(expired)
         for asked in expired:
             _refuse(asked, f"no answer within the {asked.timeout_s:g} s of its asker: too many questions")
-        if isinstance(event, HeardMany):
+        if isinstance(event, bus.HeardMany):
             with self._lock:
                 self._unread_batches -= 1
             self._batch_taken.set()
         if isinstance(event, BaseException):
             raise event
-        return event.decoded() if isinstance(event, Undecoded) else event
+        return event.decoded() if isinstance(event, bus.Undecoded) else event
 
-    def _pop(self, expired: list[Question]) -> Event | BaseException | None:
+    def _pop(self, expired: list[bus.Question]) -> bus.Event | BaseException | None:
         """Removes the next event. Questions whose time is over are removed on the way, into `expired`."""
         while self._unread:
             name = self._choose(expired)
@@ -328,12 +319,12 @@ class Inbox:
             taken = self._asked.take(newest=lambda oldest: _is_late(oldest[1]))
             assert taken is not None
             if not taken[1].expired:
-                assert isinstance(taken[1], Asked | Undecoded)
+                assert isinstance(taken[1], bus.Asked | bus.Undecoded)
                 return taken[1]
             self._expire(taken[1], expired)  # newer than the oldest, but its asker had less time
         return None
 
-    def _choose(self, expired: list[Question]) -> str | None:
+    def _choose(self, expired: list[bus.Question]) -> str | None:
         """The queue whose turn it is; None if all are empty."""
         while (oldest := self._asked.oldest()) is not None and oldest[1].expired:
             self._asked.drop_oldest()
@@ -348,7 +339,7 @@ class Inbox:
                 return turn
         return min(firsts, key=firsts.__getitem__, default=None)
 
-    def _expire(self, asked: Question, expired: list[Question]) -> None:
+    def _expire(self, asked: bus.Question, expired: list[bus.Question]) -> None:
         self.counts["asks_expired"] += 1
         expired.append(asked)
 
@@ -371,10 +362,10 @@ class Inbox:
         return self._unread
 
 
-def _is_late(asked: Question) -> bool:
+def _is_late(asked: bus.Question) -> bool:
     return asked.waited_s >= min(LATE_S, asked.timeout_s / 2)
 
 
-def _refuse(asked: Question, why: str) -> None:
+def _refuse(asked: bus.Question, why: str) -> None:
     asked.refuse(f"{asked.topic.name}: {why}")
     asked.end()

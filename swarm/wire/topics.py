@@ -1,6 +1,8 @@
 """The topics: every key of the wire with its message, rate and quality of service.
 
-`docs/reference/wire.md` is made of them."""
+`docs/reference/wire.md` is made of them, and of the docstring below each: what it is, and how often it is put or
+asked.
+"""
 
 from __future__ import annotations
 
@@ -36,8 +38,6 @@ class Topic:
 
     key                      template below the namespace; `{name}` stands for one chunk
     message                  the published message, or the reply to a query
-    what                     its meaning, for `docs/reference/wire.md`
-    rate                     how often it is put or asked, for `docs/reference/wire.md`
     access                   which roles may put, serve, ask and hear it
     request                  for a queryable: the query; None for a topic that is only published
     bulk                     for a queryable: a message that carries many values, if the request asks for it
@@ -59,8 +59,6 @@ class Topic:
     name: str
     key: str
     message: type[Message]
-    what: str
-    rate: str
     access: Access
     request: type[Message] | None = None
     bulk: type[Message] | None = None
@@ -180,270 +178,347 @@ OBEYING = "agent planner targets keeper"
 OBEYING_OWN = " ".join(f"{role}:role,id" for role in OBEYING.split())
 
 RUN = Topic(
-    "run", "run/{role}/{id}", processes.RunInfo, "run and terrain of a process",
-    "asked at every start", access(serve=MEMBERS_OWN, ask=MEMBERS), request=Nothing, published=False,
-    free=("ask", "answer"), ask_bytes=_SHORT, answer_bytes=_LONG,
+    "run", "run/{role}/{id}", processes.RunInfo, access(serve=MEMBERS_OWN, ask=MEMBERS), request=Nothing,
+    published=False, free=("ask", "answer"), ask_bytes=_SHORT, answer_bytes=_LONG,
 )  # fmt: skip
+"""Run and terrain of a process.
+
+Rate: asked at every start
+"""
 MARKS = Topic(
     "marks", "marks/{region}/{tile}/{author}", map_data.MarkSet,
-    "an author's whole set for a tile, served by the author and the keeper",
-    "on change, at most 10 Hz a tile",
     access(
         put="agent:author rover:author keeper planner", serve="agent:author rover:author keeper", ask=_REPLICAS,
         hear=f"{_REPLICAS} rover:author",
     ),
-    request=map_data.MarksRequest, bulk=map_data.MarkSets, free=("ask",), buffer=8192,
-    answer_bytes=2 * _LONG,
+    request=map_data.MarksRequest, bulk=map_data.MarkSets, free=("ask",), buffer=8192, answer_bytes=2 * _LONG,
 )  # fmt: skip
+"""An author's whole set for a tile, served by the author and the keeper.
+
+Rate: on change, at most 10 Hz a tile
+"""
 DIGEST = Topic(
-    "digest", "digest/{author}", map_data.Digest, "sets of a replica", "1 Hz, and on change",
-    access(put="agent:author rover:author keeper:author", hear=_REPLICAS),
-    priority=Priority.BACKGROUND,
+    "digest", "digest/{author}", map_data.Digest,
+    access(put="agent:author rover:author keeper:author", hear=_REPLICAS), priority=Priority.BACKGROUND,
 )  # fmt: skip
+"""Sets of a replica.
+
+Rate: 1 Hz, and on change
+"""
 BASE_MAP = Topic(
-    "base-map", "base/{keeper}", map_data.BaseMap, "terrain of a keeper, for machines without its files",
-    "asked at a start",
-    access(serve="keeper:keeper", ask=MEMBERS),
-    request=Nothing, published=False, free=("ask",), priority=Priority.BACKGROUND,
-    ask_bytes=_SHORT, answer_bytes=_FILE,
+    "base-map", "base/{keeper}", map_data.BaseMap, access(serve="keeper:keeper", ask=MEMBERS), request=Nothing,
+    published=False, free=("ask",), priority=Priority.BACKGROUND, ask_bytes=_SHORT, answer_bytes=_FILE,
 )  # fmt: skip
+"""Terrain of a keeper, for machines without its files.
+
+Rate: asked at a start
+"""
 BASE_TILES = Topic(
-    "base-tiles", "base/{keeper}/tiles", map_data.BaseMapTile, "the terrain, by layer and region",
-    "asked at a start",
-    access(serve="keeper:keeper", ask=MEMBERS),
-    request=map_data.BaseMapRequest, published=False, free=("ask",), priority=Priority.BACKGROUND,
-    ask_bytes=_LONG, answer_bytes=_FILE,
+    "base-tiles", "base/{keeper}/tiles", map_data.BaseMapTile, access(serve="keeper:keeper", ask=MEMBERS),
+    request=map_data.BaseMapRequest, published=False, free=("ask",), priority=Priority.BACKGROUND, ask_bytes=_LONG,
+    answer_bytes=_FILE,
 )  # fmt: skip
+"""The terrain, by layer and region.
+
+Rate: asked at a start
+"""
 FLEET = Topic(
-    "fleet", "fleet/{region}/{author}", vehicles.Fleet, "positions of an agent's vehicles",
-    "every tick", access(put="agent:author", hear="targets monitor planner"),
+    "fleet", "fleet/{region}/{author}", vehicles.Fleet, access(put="agent:author", hear="targets monitor planner"),
     put_bytes=_LONG,
 )  # fmt: skip
+"""Positions of an agent's vehicles.
+
+Rate: every tick
+"""
 CHASERS = Topic(
     "chasers", "target/{target}/chasers/{author}", vehicles.Chasers,
-    "vehicles of an agent which chase a target, and where their routes may begin",
-    "on change, and after a vehicle has passed the published cell; else 1 Hz",
-    access(put="agent:author", hear="planner:target"),
-    put_bytes=_LONG,
+    access(put="agent:author", hear="planner:target"), put_bytes=_LONG,
 )  # fmt: skip
+"""Vehicles of an agent which chase a target, and where their routes may begin.
+
+Rate: on change, and after a vehicle has passed the published cell; else 1 Hz
+"""
 SENT = Topic(
-    "sent", "place/{places}/sent/{author}", vehicles.Chasers,
-    "vehicles of an agent which are sent to places, and where their routes may begin",
-    "as chasers",
-    access(put="agent:author", hear="places:places"),
+    "sent", "place/{places}/sent/{author}", vehicles.Chasers, access(put="agent:author", hear="places:places"),
     put_bytes=_LONG,
 )  # fmt: skip
+"""Vehicles of an agent which are sent to places, and where their routes may begin.
+
+Rate: as chasers
+"""
 SHARED_COSTS = Topic(
-    "shared-costs", "costs/{group}/{author}", vehicles.SharedCosts,
-    "costs from an agent's vehicles to each target", "per `vehicles.reassign_s`, if `groups[].assignment` needs it",
-    access(put="agent:author", hear="agent"), echoed=False,
-    put_bytes=2 * _LONG,
+    "shared-costs", "costs/{group}/{author}", vehicles.SharedCosts, access(put="agent:author", hear="agent"),
+    echoed=False, put_bytes=2 * _LONG,
 )  # fmt: skip
+"""Costs from an agent's vehicles to each target.
+
+Rate: per `vehicles.reassign_s`, if `groups[].assignment` needs it
+"""
 HOST_STATE = Topic(
     "host_state", "host_state/{shard}/{member}/{agent}", traffic.HostState,
-    "positions and wanted cells of a host's vehicles in a shard, for its leader, or for all members without one; "
-    "each counts, because two generations of a host must not replace each other's messages",
-    "on change, else 5 Hz",
-    access(put="agent:agent rover:agent", hear="agent:member"), newest=False,
-    priority=Priority.INTERACTIVE,
+    access(put="agent:agent rover:agent", hear="agent:member"), newest=False, priority=Priority.INTERACTIVE,
     put_bytes=_LONG,
 )  # fmt: skip
+"""Positions and wanted cells of a host's vehicles in a shard, for its leader, or for all members without one; each
+counts, because two generations of a host must not replace each other's messages.
+
+Rate: on change, else 5 Hz
+"""
 TABLE = Topic(
     "table", "table/{shard}/{member}/{agent}", traffic.Table,
-    "granted cells of a shard, from its leader to a member; a member that is asked promises an epoch and replies "
-    "with its stored table", "on change, and at 5 Hz until both others have it on file",
-    access(put="agent:agent", serve="agent:agent", ask="agent:member", hear="agent:member"),
-    request=traffic.Claim, echoed=False, priority=Priority.INTERACTIVE,
-    put_bytes=_LONG, ask_bytes=_SHORT, answer_bytes=_LONG,
+    access(put="agent:agent", serve="agent:agent", ask="agent:member", hear="agent:member"), request=traffic.Claim,
+    echoed=False, priority=Priority.INTERACTIVE, put_bytes=_LONG, ask_bytes=_SHORT, answer_bytes=_LONG,
 )  # fmt: skip
+"""Granted cells of a shard, from its leader to a member; a member that is asked promises an epoch and replies with
+its stored table.
+
+Rate: on change, and at 5 Hz until both others have it on file
+"""
 GRANTED = Topic(
     "granted", "granted/{shard}/{host}/{agent}", traffic.Granted,
-    "cells of a shard granted to one host, on file with its members", "on change, else 5 Hz",
-    access(put="agent:agent", hear="agent:host rover:host"), priority=Priority.INTERACTIVE,
-    put_bytes=_LONG,
+    access(put="agent:agent", hear="agent:host rover:host"), priority=Priority.INTERACTIVE, put_bytes=_LONG,
 )  # fmt: skip
+"""Cells of a shard granted to one host, on file with its members.
+
+Rate: on change, else 5 Hz
+"""
 WORD = Topic(
-    "word", "word/{shard}/{host}/{agent}", traffic.Word,
-    "digest of a member's file for a host, which uses a grant that a majority confirms; only with certificates",
-    "on change, else 5 Hz",
-    access(put="agent:agent", hear="agent:host rover:host"), priority=Priority.INTERACTIVE,
-    put_bytes=_SHORT,
+    "word", "word/{shard}/{host}/{agent}", traffic.Word, access(put="agent:agent", hear="agent:host rover:host"),
+    priority=Priority.INTERACTIVE, put_bytes=_SHORT,
 )  # fmt: skip
+"""Digest of a member's file for a host, which uses a grant that a majority confirms; only with certificates.
+
+Rate: on change, else 5 Hz
+"""
 LEFT = Topic(
     "left", "left/{host}/{agent}", traffic.Left,
-    "cells which vehicles of a host have left, for a host whose vehicles follow; each counts",
-    "on change, and at 5 Hz until the leader has counted it",
     access(put="agent:agent rover:agent", hear="agent:host rover:host"), newest=False,
     priority=Priority.INTERACTIVE, put_bytes=_LONG,
 )  # fmt: skip
+"""Cells which vehicles of a host have left, for a host whose vehicles follow; each counts.
+
+Rate: on change, and at 5 Hz until the leader has counted it
+"""
 STORED = Topic(
-    "stored", "stored/{shard}/{member}/{agent}", traffic.Stored, "number of a member's table on file",
-    "per table by one member, 5 Hz by the other; 5 Hz by the leader instead of an unchanged table",
-    access(put="agent:agent", hear="agent:member"), echoed=False, priority=Priority.INTERACTIVE,
-    put_bytes=_SHORT,
+    "stored", "stored/{shard}/{member}/{agent}", traffic.Stored, access(put="agent:agent", hear="agent:member"),
+    echoed=False, priority=Priority.INTERACTIVE, put_bytes=_SHORT,
 )  # fmt: skip
+"""Number of a member's table on file.
+
+Rate: per table by one member, 5 Hz by the other; 5 Hz by the leader instead of an unchanged table
+"""
 KNOWN = Topic(
-    "known", "known/{agent}", traffic.Known,
-    "an agent's file on another host, for its next generation",
-    "asked at a start",
-    access(serve="agent:agent", ask="agent rover"),
-    request=traffic.KnownRequest, published=False, priority=Priority.INTERACTIVE,
-    ask_bytes=_SHORT, answer_bytes=_LONG,
+    "known", "known/{agent}", traffic.Known, access(serve="agent:agent", ask="agent rover"),
+    request=traffic.KnownRequest, published=False, priority=Priority.INTERACTIVE, ask_bytes=_SHORT,
+    answer_bytes=_LONG,
 )  # fmt: skip
+"""An agent's file on another host, for its next generation.
+
+Rate: asked at a start
+"""
 LEAVE = Topic(
-    "leave", "leave/{agent}", vehicles.Removed,
-    "vehicles which an agent has removed for an operator", "asked",
-    access(serve="agent:agent"),
-    request=vehicles.RemoveVehicles, published=False, priority=Priority.INTERACTIVE,
-    ask_bytes=_LONG, answer_bytes=_LONG,
+    "leave", "leave/{agent}", vehicles.Removed, access(serve="agent:agent"), request=vehicles.RemoveVehicles,
+    published=False, priority=Priority.INTERACTIVE, ask_bytes=_LONG, answer_bytes=_LONG,
 )  # fmt: skip
+"""Vehicles which an agent has removed for an operator.
+
+Rate: asked
+"""
 FOLLOWED = Topic(
-    "followed", "vehicle/{agent}/{vehicle}/followed", vehicles.Followed, "the route that a vehicle has begun",
-    "per new route",
-    access(put="agent:agent", hear="monitor"),
-    priority=Priority.BACKGROUND,
-    put_bytes=_LONG,
+    "followed", "vehicle/{agent}/{vehicle}/followed", vehicles.Followed, access(put="agent:agent", hear="monitor"),
+    priority=Priority.BACKGROUND, put_bytes=_LONG,
 )  # fmt: skip
+"""The route that a vehicle has begun.
+
+Rate: per new route
+"""
 PUSHED_ROUTE = Topic(
     "pushed-route", "vehicle/{agent}/{vehicle}/route", planning.PushedRoute,
-    "a newer route for a vehicle", "per update",
-    access(put="planner places", hear="agent:agent rover:agent"),
-    put_bytes=_LONG,
+    access(put="planner places", hear="agent:agent rover:agent"), put_bytes=_LONG,
 )  # fmt: skip
+"""A newer route for a vehicle.
+
+Rate: per update
+"""
 POSE = Topic(
     "pose", "target/{target}/pose", planning.TargetPose,
-    "position of a target, from a tracker; each counts, because trackers must not replace each other's messages",
-    "per quarter of a cell, at least 2 Hz",
     access(put="targets tracker:target", hear="agent planner targets monitor tracker:target"), newest=False,
-    free=("put",),
-    put_bytes=_SHORT,
+    free=("put",), put_bytes=_SHORT,
 )  # fmt: skip
+"""Position of a target, from a tracker; each counts, because trackers must not replace each other's messages.
+
+Rate: per quarter of a cell, at least 2 Hz
+"""
 TRUE_POSE = Topic(
-    "true-pose", "world/target/{target}/pose", planning.TargetPose,
-    "position of an untracked target, for simulated sensors only", "as poses",
-    access(put="targets", hear="agent targets"),
+    "true-pose", "world/target/{target}/pose", planning.TargetPose, access(put="targets", hear="agent targets"),
     put_bytes=_SHORT,
 )  # fmt: skip
+"""Position of an untracked target, for simulated sensors only.
+
+Rate: as poses
+"""
 SIGHTED = Topic(
-    "sighted", "sighted/{target}/{author}", planning.Sighted, "position of a target, seen by a vehicle",
-    "while it is in sight, at most 2 Hz",
-    access(put="agent:author", hear="agent planner keeper monitor"),
-    put_bytes=_SHORT,
+    "sighted", "sighted/{target}/{author}", planning.Sighted,
+    access(put="agent:author", hear="agent planner keeper monitor"), put_bytes=_SHORT,
 )  # fmt: skip
+"""Position of a target, seen by a vehicle.
+
+Rate: while it is in sight, at most 2 Hz
+"""
 OBSTACLE = Topic(
-    "body", "body/{id}", vehicles.Obstacle,
-    "position of an obstacle, such as an outside vehicle or a person; each counts, because two senders under one "
-    "id must not replace each other's messages",
-    "10 Hz in motion, else at least 1 Hz",
-    access(put="rover:id targets", hear="agent rover targets monitor"), newest=False,
-    free=("put",), priority=Priority.INTERACTIVE,
-    put_bytes=_SHORT,
+    "body", "body/{id}", vehicles.Obstacle, access(put="rover:id targets", hear="agent rover targets monitor"),
+    newest=False, free=("put",), priority=Priority.INTERACTIVE, put_bytes=_SHORT,
 )  # fmt: skip
+"""Position of an obstacle, such as an outside vehicle or a person; each counts, because two senders under one id
+must not replace each other's messages.
+
+Rate: 10 Hz in motion, else at least 1 Hz
+"""
 ROUTE = Topic(
-    "route", "target/{target}/route/{asker}", planning.RouteReply, "routes from cells to the target", "asked",
-    access(serve="planner:target", ask="agent:asker rover:asker"),
-    request=planning.RouteRequest, published=False, costly=True, free=("ask",),
-    ask_bytes=_LONG, answer_bytes=4 * _LONG,
+    "route", "target/{target}/route/{asker}", planning.RouteReply,
+    access(serve="planner:target", ask="agent:asker rover:asker"), request=planning.RouteRequest, published=False,
+    costly=True, free=("ask",), ask_bytes=_LONG, answer_bytes=4 * _LONG,
 )  # fmt: skip
+"""Routes from cells to the target.
+
+Rate: asked
+"""
 PLACE_ROUTE = Topic(
-    "place-route", "place/{places}/route/{asker}", planning.PlaceRouteReply, "routes from cells to a place",
-    "asked",
-    access(serve="places:places", ask="agent:asker rover:asker"),
-    request=planning.PlaceRouteRequest, published=False, costly=True, free=("ask",),
-    ask_bytes=_LONG, answer_bytes=4 * _LONG,
+    "place-route", "place/{places}/route/{asker}", planning.PlaceRouteReply,
+    access(serve="places:places", ask="agent:asker rover:asker"), request=planning.PlaceRouteRequest,
+    published=False, costly=True, free=("ask",), ask_bytes=_LONG, answer_bytes=4 * _LONG,
 )  # fmt: skip
+"""Routes from cells to a place.
+
+Rate: asked
+"""
 COST = Topic(
-    "cost", "target/{target}/cost/{asker}", planning.CostReply, "cost-to-go of a batch of cells", "asked",
+    "cost", "target/{target}/cost/{asker}", planning.CostReply,
     access(serve="planner:target", ask="agent:asker targets:asker monitor:asker rover:asker"),
-    request=planning.CostRequest, published=False, costly=True, free=("ask",),
-    ask_bytes=_LONG, answer_bytes=2 * _LONG,
+    request=planning.CostRequest, published=False, costly=True, free=("ask",), ask_bytes=_LONG,
+    answer_bytes=2 * _LONG,
 )  # fmt: skip
-_NAMELESS = "the same for askers without a name, which share one turn"
+"""Cost-to-go of a batch of cells.
+
+Rate: asked
+"""
 NAMELESS_ROUTE = replace(
-    ROUTE, name="nameless-route", key="target/{target}/route", what=_NAMELESS,
+    ROUTE, name="nameless-route", key="target/{target}/route",
     access=access(serve="planner:target", ask="agent rover"),
 )  # fmt: skip
+"""The same for askers without a name, which share one turn.
+
+Rate: asked
+"""
 NAMELESS_COST = replace(
-    COST, name="nameless-cost", key="target/{target}/cost", what=_NAMELESS,
+    COST, name="nameless-cost", key="target/{target}/cost",
     access=access(serve="planner:target", ask="agent targets monitor rover"),
 )  # fmt: skip
+"""The same for askers without a name, which share one turn.
+
+Rate: asked
+"""
 STATUS = Topic(
-    "status", "target/{target}/status", planning.PlannerStatus, "state of a planner", "2 Hz",
-    access(put="planner:target", hear="targets monitor tracker:target"),
-    priority=Priority.BACKGROUND,
+    "status", "target/{target}/status", planning.PlannerStatus,
+    access(put="planner:target", hear="targets monitor tracker:target"), priority=Priority.BACKGROUND,
     put_bytes=_SHORT,
 )  # fmt: skip
+"""State of a planner.
+
+Rate: 2 Hz
+"""
 BELIEVED = Topic(
-    "believed", "target/{target}/believed", planning.Believed, "likely places of a target which is searched for",
-    "1 Hz during a search",
-    access(put="planner:target", hear="monitor"),
-    priority=Priority.BACKGROUND,
-    put_bytes=_USUAL // 4,
+    "believed", "target/{target}/believed", planning.Believed, access(put="planner:target", hear="monitor"),
+    priority=Priority.BACKGROUND, put_bytes=_USUAL // 4,
 )  # fmt: skip
+"""Likely places of a target which is searched for.
+
+Rate: 1 Hz during a search
+"""
 LEAD = Topic(
-    "lead", "lead/{role}/{id}", processes.Heartbeat, "readiness and leadership among processes with one job",
-    "10 Hz, where there are standbys",
+    "lead", "lead/{role}/{id}", processes.Heartbeat,
     access(put="planner:role,id places:role,id targets:role,id", hear="planner places targets monitor"),
-    priority=Priority.INTERACTIVE,
-    put_bytes=_SHORT,
+    priority=Priority.INTERACTIVE, put_bytes=_SHORT,
 )  # fmt: skip
+"""Readiness and leadership among processes with one job.
+
+Rate: 10 Hz, where there are standbys
+"""
 ZONES = Topic(
-    "zones", "order/{keeper}/zone", orders.Zones, "adds, removes and lists zones",
-    "asked by people", access(serve="keeper:keeper"),
-    request=orders.ZoneOrder, published=False, priority=Priority.INTERACTIVE,
-    answer_bytes=_FILE,
+    "zones", "order/{keeper}/zone", orders.Zones, access(serve="keeper:keeper"), request=orders.ZoneOrder,
+    published=False, priority=Priority.INTERACTIVE, answer_bytes=_FILE,
 )  # fmt: skip
+"""Adds, removes and lists zones.
+
+Rate: asked by people
+"""
 GIVE_ORDER = Topic(
-    "give-order", "order/{keeper}/give", orders.Orders,
-    "gives an order: pause, stop, targets of a group, added targets, settings", "asked by people",
-    access(serve="keeper:keeper"), request=orders.GiveOrder, published=False,
-    priority=Priority.INTERACTIVE, ask_bytes=_LONG, answer_bytes=4 * _LONG,
+    "give-order", "order/{keeper}/give", orders.Orders, access(serve="keeper:keeper"), request=orders.GiveOrder,
+    published=False, priority=Priority.INTERACTIVE, ask_bytes=_LONG, answer_bytes=4 * _LONG,
 )  # fmt: skip
+"""Gives an order: pause, stop, targets of a group, added targets, settings.
+
+Rate: asked by people
+"""
 ORDERS = Topic(
     "orders", "orders/{role}/{id}", orders.Orders,
-    "orders in force, from keepers; without a keeper, from any process to a starting one", "1 Hz, and on change",
-    access(put="keeper:role,id", serve=OBEYING_OWN, ask=OBEYING, hear=f"{OBEYING} monitor"),
-    request=Nothing, priority=Priority.INTERACTIVE,
-    put_bytes=4 * _LONG, ask_bytes=_SHORT, answer_bytes=4 * _LONG,
+    access(put="keeper:role,id", serve=OBEYING_OWN, ask=OBEYING, hear=f"{OBEYING} monitor"), request=Nothing,
+    priority=Priority.INTERACTIVE, put_bytes=4 * _LONG, ask_bytes=_SHORT, answer_bytes=4 * _LONG,
 )  # fmt: skip
+"""Orders in force, from keepers; without a keeper, from any process to a starting one.
+
+Rate: 1 Hz, and on change
+"""
 OBEYED = Topic(
-    "obeyed", "obeyed/{role}/{id}", orders.Obeyed, "reply as soon as a process obeys an order",
-    "asked after each order", access(serve="agent:role,id planner:role,id targets:role,id"),
-    request=orders.Obey, published=False, priority=Priority.INTERACTIVE,
-    ask_bytes=_LONG, answer_bytes=_SHORT,
+    "obeyed", "obeyed/{role}/{id}", orders.Obeyed, access(serve="agent:role,id planner:role,id targets:role,id"),
+    request=orders.Obey, published=False, priority=Priority.INTERACTIVE, ask_bytes=_LONG, answer_bytes=_SHORT,
 )  # fmt: skip
+"""Reply as soon as a process obeys an order.
+
+Rate: asked after each order
+"""
 SEND_VEHICLE = Topic(
-    "send-vehicle", "order/{keeper}/send", orders.Goals,
-    "sends a vehicle to places, recalls it, and lists sent vehicles", "asked by people",
-    access(serve="keeper:keeper"), request=orders.SendVehicle, published=False,
-    priority=Priority.INTERACTIVE, answer_bytes=_FILE,
+    "send-vehicle", "order/{keeper}/send", orders.Goals, access(serve="keeper:keeper"), request=orders.SendVehicle,
+    published=False, priority=Priority.INTERACTIVE, answer_bytes=_FILE,
 )  # fmt: skip
+"""Sends a vehicle to places, recalls it, and lists sent vehicles.
+
+Rate: asked by people
+"""
 GOALS = Topic(
     "goals", "goals/{id}/{agent}", orders.Goals,
-    "places to which an agent's vehicles are sent, as on a keeper's disk",
-    "1 Hz for agents with goals, and on change",
     access(put="keeper:id", serve="keeper:id", ask="agent:agent keeper", hear="agent:agent keeper"),
-    request=Nothing, priority=Priority.INTERACTIVE,
-    put_bytes=4 * _LONG, ask_bytes=_SHORT, answer_bytes=4 * _LONG,
+    request=Nothing, priority=Priority.INTERACTIVE, put_bytes=4 * _LONG, ask_bytes=_SHORT, answer_bytes=4 * _LONG,
 )  # fmt: skip
+"""Places to which an agent's vehicles are sent, as on a keeper's disk.
+
+Rate: 1 Hz for agents with goals, and on change
+"""
 GOAL_STATES = Topic(
-    "goal-states", "reached/{agent}", orders.GoalStates, "progress of an agent's vehicles towards their places",
-    "1 Hz for agents with goals, and on change", access(put="agent:agent", hear="keeper monitor"),
+    "goal-states", "reached/{agent}", orders.GoalStates, access(put="agent:agent", hear="keeper monitor"),
     put_bytes=_LONG,
 )  # fmt: skip
+"""Progress of an agent's vehicles towards their places.
+
+Rate: 1 Hz for agents with goals, and on change
+"""
 STATS = Topic(
     "stats", "stats/{role}/{id}", processes.Stats,
-    "counts of a process; keepers serve the last ones of ended processes", "1 Hz",
-    access(put=MEMBERS_OWN, serve="keeper", ask="monitor", hear="monitor keeper"),
-    request=Nothing, free=("ask",), priority=Priority.BACKGROUND,
-    put_bytes=_LONG, ask_bytes=_SHORT, answer_bytes=_LONG,
+    access(put=MEMBERS_OWN, serve="keeper", ask="monitor", hear="monitor keeper"), request=Nothing, free=("ask",),
+    priority=Priority.BACKGROUND, put_bytes=_LONG, ask_bytes=_SHORT, answer_bytes=_LONG,
 )  # fmt: skip
+"""Counts of a process; keepers serve the last ones of ended processes.
+
+Rate: 1 Hz
+"""
 NOTE = Topic(
-    "note", "note/{role}/{id}", processes.Note, "event for people", "as it happens",
-    access(put=MEMBERS_OWN, hear="monitor"),
-    newest=False, priority=Priority.BACKGROUND,
-    put_bytes=_USUAL // 4,
+    "note", "note/{role}/{id}", processes.Note, access(put=MEMBERS_OWN, hear="monitor"), newest=False,
+    priority=Priority.BACKGROUND, put_bytes=_USUAL // 4,
 )  # fmt: skip
+"""Event for people.
+
+Rate: as it happens
+"""
 
 TOPICS = (
     RUN, MARKS, DIGEST, BASE_MAP, BASE_TILES, FLEET, CHASERS, SENT, SHARED_COSTS, HOST_STATE, TABLE, GRANTED, WORD,

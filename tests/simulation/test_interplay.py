@@ -298,7 +298,7 @@ class Interplay:
                     continue
                 cell, stood, at_rest = before[id]
                 drives = cell != vehicle.cell or not vehicle.motion.at_rest
-                if stood and at_rest and drives and service._obedience.book.stopped(id):
+                if stood and at_rest and drives and service._order_client.book.stopped(id):
                     self.broken.append(f"{now_s:.2f} {id} is ordered to stand and drives")
                 if cell == vehicle.cell:
                     continue
@@ -312,7 +312,7 @@ class Interplay:
             if towards is not None and towards == vehicle.motion.entering and lethal[towards]:
                 self.broken.append(f"{now_s:.2f} {id} drives towards {towards}, which is lethal")
         self._seen.update(agent.vehicles)
-        stopped = service._obedience.book.stopped
+        stopped = service._order_client.book.stopped
         states = {id: (v.cell, stopped(id), v.motion.at_rest) for id, v in agent.vehicles.items()}
         self._before[node.name] = (service, states, pace.copy(), set(agent.obstacles._closed))
 
@@ -355,9 +355,9 @@ class Interplay:
             if not kept.knows(order.subject, order.name, order.stamp_ns):
                 found.append(f"the keeper has lost {order}")
         for node in simulation.nodes.values():
-            obedience = getattr(node.service, "_obedience", None)
-            if obedience is not None and list(obedience.book) != list(kept):
-                found.append(f"{node.name} goes by another book: {obedience.book.standing} not {kept.standing}")
+            client = getattr(node.service, "_order_client", None)
+            if client is not None and list(client.book) != list(kept):
+                found.append(f"{node.name} goes by another book: {client.book.standing} not {kept.standing}")
         return found
 
 

@@ -87,14 +87,14 @@ class TargetsService:
             homes=load_homes(setup, terrain, truth),
             leads=self._candidacy.leads,
         )
-        self._obedience = OrderClient(setup, bus, post, self._obeys)
+        self._order_client = OrderClient(setup, bus, post, self._obeys)
         self._obeyed_version: int | None = None
         self._anew, self._began_ns = setup.anew, setup.started_ns
         self._subscribed: set[str] = set()
         """Targets whose poses we subscribe to: those of others, and as one of several of this job all."""
         self._throttle = PoseThrottle(terrain.grid.resolution_m)
         self._planners = Roster()
-        self._member.needs("the orders of this run", lambda: self._obedience.known)
+        self._member.needs("the orders of this run", lambda: self._order_client.known)
         self._member.needs("places of its targets", lambda: self._world.ready)
         self.counters = self._member.counters
         for name in ("captures", *ALARMS, "poses"):
@@ -110,11 +110,11 @@ class TargetsService:
         self._bus.subscribe(STATUS, self._post)
         self._bus.watch_alive(self._post, role="planner")
         self._subscribe_targets()
-        self._obedience.start(now_ns)
+        self._order_client.start(now_ns)
         self._candidacy.start()
 
     def _subscribe_targets(self) -> None:
-        for id, target in self._obedience.book.targets(self._scenario).items():
+        for id, target in self._order_client.book.targets(self._scenario).items():
             if id not in self._subscribed and (not target.is_simulated or self._scenario.standbys.targets):
                 self._subscribed.add(id)
                 self._bus.subscribe(self._topic(id), self._post, target=id)
@@ -122,7 +122,7 @@ class TargetsService:
     def handle(self, event: Event, now_ns: int) -> None:
         if self._member.on_member_event(event) or self._candidacy.on_election_event(event, now_ns):
             return
-        if self._obedience.on_order_event(event, now_ns):
+        if self._order_client.on_order_event(event, now_ns):
             return
         match event:
             case Heard(message=Fleet() as fleet):
@@ -163,7 +163,7 @@ class TargetsService:
 
     def _obey(self, now_ns: int) -> None:
         """Applies orders. Nothing moves before it is known whether the swarm is paused."""
-        orders, version = self._obedience, self._obeyed_version
+        orders, version = self._order_client, self._obeyed_version
         if not orders.known:
             self._world.paused = True
         elif version != orders.book.version:
@@ -176,7 +176,7 @@ class TargetsService:
         orders.tick(now_ns)
 
     def _obeys(self, order: Obey) -> bool:
-        return self._obeyed_version == self._obedience.book.version
+        return self._obeyed_version == self._order_client.book.version
 
     def _topic(self, target: str) -> Topic:
         return TRUE_POSE if target in self._scenario.untracked else POSE

@@ -12,17 +12,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from launch_scripts.simulation.world import walks
 from launch_scripts.simulation.world.referee import Broken, Referee
 from launch_scripts.simulation.world.rovers import Rovers
-from launch_scripts.simulation.world.walks import (
-    Budget,
-    TrueTerrain,
-    Walker,
-    WalkWorld,
-    far_place,
-    slowness_of,
-    walk_of,
-)
 from shared_map.array_files import Bools, Floats, private_copy
 from shared_map.terrain.map_frame import MapFrame
 from shared_map.terrain.pace_layers import inflate, inflation_halves
@@ -70,7 +62,7 @@ Action = TargetPose | Captured | Broken | Obstacle
 @dataclass(eq=False)
 class _Target:
     config: TargetConfig
-    walker: Walker
+    walker: walks.Walker
     x_m: float
     y_m: float
     chance: random.Random
@@ -118,14 +110,14 @@ class TargetWorld:
     ) -> None:
         self.leads = leads
         self.faults: list[str] = []
-        self._budget = Budget()
+        self._budget = walks.Budget()
         self._grid = terrain.grid
         # A target keeps to cells where a vehicle fits, by the truth and by the prior map: others are out of reach.
         halves = inflation_halves(terrain.vehicle_radius_m, terrain.grid.resolution_m)
         pace: Floats = inflate(truth_s_per_m, halves) if halves else private_copy(truth_s_per_m)
         # Few cells, so that most pages of the truth stay shared.
         pace[terrain.lethal & np.isfinite(pace)] = np.inf
-        self._terrain = TrueTerrain(terrain.grid, pace, terrain.climb, None if halves else homes)
+        self._terrain = walks.TrueTerrain(terrain.grid, pace, terrain.climb, None if halves else homes)
         self._referee = Referee(
             class_truths(scenario, terrain, truth_s_per_m), terrain.grid, aloft_classes(scenario)
         )
@@ -158,9 +150,9 @@ class TargetWorld:
                 raise ConfigError(f"target {id}: start {place} is lethal; choose a passable cell")
         # An order names a built-in walk by its type: nothing that comes over the network is imported.
         plugin = find_plugin(walk_named_by(config, key), scenario.plugin_folder)
-        world = WalkWorld(id, self._terrain, chance, self._budget)
-        walk = walk_of(plugin, world, lambda fault: self.faults.append(f"target {id}: {fault}"))
-        walker = Walker(id, walk, slowness_of(config, scenario.cost), cell)
+        world = walks.WalkWorld(id, self._terrain, chance, self._budget)
+        walk = walks.walk_of(plugin, world, lambda fault: self.faults.append(f"target {id}: {fault}"))
+        walker = walks.Walker(id, walk, walks.slowness_of(config, scenario.cost), cell)
         return _Target(config, walker, *self._grid.centre_m(cell), chance)
 
     def obey(self, book: OrderBook, scenario: Scenario, now_ns: int, *, first: bool) -> list[Action]:
@@ -361,6 +353,6 @@ class TargetWorld:
             target.jumps += 1
             clear_cells = 1 + int(2 * self._capture_range_m / self._grid.resolution_m)
             walker = target.walker
-            walker.put(far_place(self._terrain, walker.cell, self._referee.cells, clear_cells, target.chance))
+            walker.put(walks.far_place(self._terrain, walker.cell, self._referee.cells, clear_cells, target.chance))
             actions.append(self._pose(id, target, now_ns))
         return actions

@@ -10,23 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 from msgspec import Meta
 
 from swarm.grid import TILE_CELLS, GridSpec
-from swarm.wire.fields import (
-    Column,
-    GridSide,
-    Id,
-    LongText,
-    Metres,
-    Natural,
-    Region,
-    Resolution,
-    Tile,
-    Word,
-    check_column,
-    column,
-    np,
-    numpy_loaded,
-    width_of,
-)
+from swarm.wire import fields
 from swarm.wire.messages import Message, schema_of
 
 if TYPE_CHECKING:
@@ -67,20 +51,20 @@ def check_lengths(
     count: int, cells: bytes, kinds: bytes, paces: bytes, stamps_ns: bytes, untils_ns: bytes = b""
 ) -> None:
     """Raises ValueError unless these are columns of `count` statements; `untils_ns` may be empty."""
-    check_column("cells", cells, 2, count)
-    check_column("kinds", kinds, 1, count)
-    check_column("paces", paces, 4, count)
-    check_column("stamps_ns", stamps_ns, 8, count)
+    fields.check_column("cells", cells, 2, count)
+    fields.check_column("kinds", kinds, 1, count)
+    fields.check_column("paces", paces, 4, count)
+    fields.check_column("stamps_ns", stamps_ns, 8, count)
     if untils_ns:
-        check_column("untils_ns", untils_ns, 8, count)
+        fields.check_column("untils_ns", untils_ns, 8, count)
 
 
 def check_statements(cells: bytes, kinds: bytes, paces: bytes, stamps_ns: bytes) -> None:
     """Raises ValueError with the rule that the columns of one set break. It has one or more statements."""
     if max(kinds) > LAST_KIND:
         raise ValueError(f"kind {max(kinds)} is not in 0..{LAST_KIND}")
-    if len(kinds) > _FEW and numpy_loaded():
-        counts = np.array([len(kinds)], np.int64)
+    if len(kinds) > _FEW and fields.numpy_loaded():
+        counts = fields.np.array([len(kinds)], fields.np.int64)
         if not faulty_sets(counts, cells, kinds, paces, stamps_ns).size:
             return
     listed = memoryview(cells).cast("H").tolist()
@@ -95,24 +79,24 @@ def check_statements(cells: bytes, kinds: bytes, paces: bytes, stamps_ns: bytes)
 
 
 def faulty_sets(
-    counts: NDArray[np.int64], cells: bytes, kinds: bytes, paces: bytes, stamps_ns: bytes
-) -> NDArray[np.int64]:
+    counts: NDArray[fields.np.int64], cells: bytes, kinds: bytes, paces: bytes, stamps_ns: bytes
+) -> NDArray[fields.np.int64]:
     """Numbers of the sets that break a rule of `check_statements`, in order.
 
     counts  int64 (sets,)  statements of each set; the columns hold those of all sets, one set after the other
     """
-    cell, kind = column(cells, "<u2"), column(kinds, "<u1")
-    pace, stamp_ns = column(paces, "<f4"), column(stamps_ns, "<i8")
+    cell, kind = fields.column(cells, "<u2"), fields.column(kinds, "<u1")
+    pace, stamp_ns = fields.column(paces, "<f4"), fields.column(stamps_ns, "<i8")
     wrong = (cell >= TILE_AREA) | (kind > LAST_KIND) | (stamp_ns < 0) | (stamp_ns >= STAMP_LIMIT_NS)
     wrong |= (kind == MarkKind.PACE) & ~((pace >= PACE_LEAST) & (pace <= PACE_MOST))
-    fallen = np.zeros(len(cell), bool)
+    fallen = fields.np.zeros(len(cell), bool)
     fallen[1:] = cell[1:] <= cell[:-1]
-    starts = np.cumsum(counts) - counts
+    starts = fields.np.cumsum(counts) - counts
     fallen[starts[counts > 0]] = False
     wrong |= fallen
     if not wrong.any():
-        return np.empty(0, np.int64)
-    return np.unique(np.repeat(np.arange(len(counts)), counts)[wrong])
+        return fields.np.empty(0, fields.np.int64)
+    return fields.np.unique(fields.np.repeat(fields.np.arange(len(counts)), counts)[wrong])
 
 
 SEQ_STEP = 1 << 16
@@ -120,15 +104,15 @@ SEQ_STEP = 1 << 16
 _ROW = (("tile", "<u4"), ("epoch", "<u8"), ("seq", "<u8"))
 DIGEST_ROW = list(_ROW)
 """Row type, as NumPy wants it."""
-DIGEST_ROW_BYTES = width_of(_ROW)
+DIGEST_ROW_BYTES = fields.width_of(_ROW)
 MOST_TILES = 1 << 18
 """Named in one message: every tile of a map of 16,384 x 16,384 cells."""
-DigestRows = Annotated[bytes, Meta(max_length=DIGEST_ROW_BYTES * MOST_TILES), Column(_ROW)]
+DigestRows = Annotated[bytes, Meta(max_length=DIGEST_ROW_BYTES * MOST_TILES), fields.Column(_ROW)]
 _AUTHORS = Meta(max_length=1 << 16)
-_Cells = Annotated[bytes, Column("<u2", per="kinds", least=0, most=TILE_AREA - 1, checked=False)]
-_Kinds = Annotated[bytes, Column("<u1", least=0, most=LAST_KIND, checked=False)]
-_Paces = Annotated[bytes, Column("<f4", per="kinds", least=PACE_LEAST, most=PACE_MOST, checked=False)]
-_Stamps = Annotated[bytes, Column("<i8", per="kinds", least=0, most=STAMP_LIMIT_NS - 1, checked=False)]
+_Cells = Annotated[bytes, fields.Column("<u2", per="kinds", least=0, most=TILE_AREA - 1, checked=False)]
+_Kinds = Annotated[bytes, fields.Column("<u1", least=0, most=LAST_KIND, checked=False)]
+_Paces = Annotated[bytes, fields.Column("<f4", per="kinds", least=PACE_LEAST, most=PACE_MOST, checked=False)]
+_Stamps = Annotated[bytes, fields.Column("<i8", per="kinds", least=0, most=STAMP_LIMIT_NS - 1, checked=False)]
 
 
 def owner_of(author: str) -> str:
@@ -157,16 +141,16 @@ class MarkSet(Message, frozen=True, kw_only=True, gc=False, tag=schema_of("marks
     once, by the rules of `swarm.wire.messages.map_data`.
     """
 
-    author: Id
-    group: Id
-    tile: Tile
-    epoch: Natural
-    seq: Natural
+    author: fields.Id
+    group: fields.Id
+    tile: fields.Tile
+    epoch: fields.Natural
+    seq: fields.Natural
     cells: _Cells
     kinds: Annotated[_Kinds, Meta(max_length=TILE_AREA)]
     paces: _Paces
     stamps_ns: _Stamps
-    untils_ns: Annotated[bytes, Meta(max_length=8 * TILE_AREA), Column("<i8")] = b""
+    untils_ns: Annotated[bytes, Meta(max_length=8 * TILE_AREA), fields.Column("<i8")] = b""
 
     def __post_init__(self) -> None:
         pass
@@ -192,18 +176,18 @@ class MarkSets(Message, frozen=True, kw_only=True, gc=False, tag=schema_of("mark
     untils_ns  of the statements of the sets that have them
     """
 
-    author: Id
-    group: Id
-    tiles: Annotated[bytes, Column("<u4", per="ending", least=0, most=(1 << 22) - 1)]
-    epochs: Annotated[bytes, Column("<u8", per="ending", least=0, most=(1 << 62) - 1)]
-    seqs: Annotated[bytes, Column("<u8", per="ending", least=0, most=(1 << 62) - 1)]
-    counts: Annotated[bytes, Column("<u2", per="ending", least=0, most=TILE_AREA)]
-    ending: Annotated[bytes, Meta(max_length=MOST_TILES), Column("<u1", least=0, most=1)]
+    author: fields.Id
+    group: fields.Id
+    tiles: Annotated[bytes, fields.Column("<u4", per="ending", least=0, most=(1 << 22) - 1)]
+    epochs: Annotated[bytes, fields.Column("<u8", per="ending", least=0, most=(1 << 62) - 1)]
+    seqs: Annotated[bytes, fields.Column("<u8", per="ending", least=0, most=(1 << 62) - 1)]
+    counts: Annotated[bytes, fields.Column("<u2", per="ending", least=0, most=TILE_AREA)]
+    ending: Annotated[bytes, Meta(max_length=MOST_TILES), fields.Column("<u1", least=0, most=1)]
     cells: _Cells
     kinds: Annotated[_Kinds, Meta(max_length=1 << 20)]
     paces: _Paces
     stamps_ns: _Stamps
-    untils_ns: Annotated[bytes, Meta(max_length=8 << 20), Column("<i8")] = b""
+    untils_ns: Annotated[bytes, Meta(max_length=8 << 20), fields.Column("<i8")] = b""
 
     def __post_init__(self) -> None:
         pass
@@ -212,14 +196,14 @@ class MarkSets(Message, frozen=True, kw_only=True, gc=False, tag=schema_of("mark
         self.check_bounds()
 
     def relate(self) -> None:
-        if not numpy_loaded():
+        if not fields.numpy_loaded():
             raise ValueError("many sets at once are read with NumPy only: ask without `bulk`")
         sets = len(self.ending)
-        counts = column(self.counts, "<u2").astype(np.int64)
-        ending = column(self.ending, "<u1")
+        counts = fields.column(self.counts, "<u2").astype(fields.np.int64)
+        ending = fields.column(self.ending, "<u1")
         check_lengths(int(counts.sum()), self.cells, self.kinds, self.paces, self.stamps_ns)
-        check_column("untils_ns", self.untils_ns, 8, int(counts[ending == 1].sum()))
-        if len(np.unique(column(self.tiles, "<u4"))) < sets:
+        fields.check_column("untils_ns", self.untils_ns, 8, int(counts[ending == 1].sum()))
+        if len(fields.np.unique(fields.column(self.tiles, "<u4"))) < sets:
             raise ValueError("tiles names a tile twice")
         faulty = faulty_sets(counts, self.cells, self.kinds, self.paces, self.stamps_ns)
         if len(faulty):
@@ -232,7 +216,7 @@ A replica that holds more publishes parts (`Digest.after`)."""
 KEEPERS = "keeper"
 """The authors under which keepers publish digests begin with this and a dot, and no group is called so: an author's
 role is what its name says, as access is granted by name."""
-_Place = tuple[Id, Tile]
+_Place = tuple[fields.Id, fields.Tile]
 
 
 class Digest(Message, frozen=True, kw_only=True, tag=schema_of("digest")):
@@ -247,11 +231,11 @@ class Digest(Message, frozen=True, kw_only=True, tag=schema_of("digest")):
     until  of a part: the author and the tile with which it ends; none if it ends with the last
     """
 
-    author: Id
-    role: Word
-    held: Annotated[dict[Id, DigestRows], _AUTHORS]
+    author: fields.Id
+    role: fields.Word
+    held: Annotated[dict[fields.Id, DigestRows], _AUTHORS]
     whole: bool = True
-    seq: Natural = 0
+    seq: fields.Natural = 0
     after: _Place | None = None
     until: _Place | None = None
 
@@ -276,8 +260,8 @@ class MarksRequest(Message, frozen=True, kw_only=True, tag=schema_of("marks-requ
     bulk  answers may be MarkSets, under a key with `-` for region and tile
     """
 
-    authors: Annotated[list[Id], _AUTHORS] = []
-    tiles: Annotated[list[Tile], Meta(max_length=MOST_TILES)] = []
+    authors: Annotated[list[fields.Id], _AUTHORS] = []
+    tiles: Annotated[list[fields.Tile], Meta(max_length=MOST_TILES)] = []
     bulk: bool = False
 
 
@@ -295,21 +279,21 @@ class BaseMap(Message, frozen=True, kw_only=True, tag=schema_of("base-map")):
     notes    sentences about where the terrain came from
     """
 
-    keeper: Id
-    terrain: Word
-    rows: GridSide
-    cols: GridSide
-    resolution_m: Resolution
-    west_m: Metres
-    north_m: Metres
-    crs: LongText
-    digests: Annotated[dict[Word, Annotated[bytes, _DIGESTS]], _LAYERS]
-    notes: Annotated[list[LongText], Meta(max_length=1000)] = []
+    keeper: fields.Id
+    terrain: fields.Word
+    rows: fields.GridSide
+    cols: fields.GridSide
+    resolution_m: fields.Resolution
+    west_m: fields.Metres
+    north_m: fields.Metres
+    crs: fields.LongText
+    digests: Annotated[dict[fields.Word, Annotated[bytes, _DIGESTS]], _LAYERS]
+    notes: Annotated[list[fields.LongText], Meta(max_length=1000)] = []
 
     def relate(self) -> None:
         regions = self.grid.regions
         for layer, digests in self.digests.items():
-            check_column(f"digests of {layer[:40]}", digests, BASE_DIGEST_BYTES, regions)
+            fields.check_column(f"digests of {layer[:40]}", digests, BASE_DIGEST_BYTES, regions)
 
     @property
     def grid(self) -> GridSpec:
@@ -319,14 +303,14 @@ class BaseMap(Message, frozen=True, kw_only=True, tag=schema_of("base-map")):
 class BaseMapRequest(Message, frozen=True, kw_only=True, tag=schema_of("base-map-request")):
     """Asks a keeper for these layers of these regions."""
 
-    layers: Annotated[list[Word], _LAYERS] = []
-    regions: Annotated[list[Region], Meta(max_length=MOST_REGIONS)] = []
+    layers: Annotated[list[fields.Word], _LAYERS] = []
+    regions: Annotated[list[fields.Region], Meta(max_length=MOST_REGIONS)] = []
 
 
 class BaseMapTile(Message, frozen=True, kw_only=True, tag=schema_of("base-map-tile")):
     """One layer of one region. `data` is zlib of the values' bytes: first the lowest byte of every value, row by
     row, then the next. Similar bytes side by side compress better."""
 
-    layer: Word
-    region: Region
+    layer: fields.Word
+    region: fields.Region
     data: Annotated[bytes, Meta(max_length=4 << 20)]

@@ -9,22 +9,7 @@ from msgspec import Meta
 
 from swarm.errors import ConfigError
 from swarm.places import read_place
-from swarm.wire.fields import (
-    IDS,
-    LARGE,
-    Bounded,
-    Cell,
-    CellIndex,
-    Count,
-    Gauge,
-    Id,
-    Incarnation,
-    Metres,
-    StampNs,
-    VehicleId,
-    Word,
-    check_id,
-)
+from swarm.wire import fields
 from swarm.wire.messages import Message, schema_of
 from swarm.wire.messages.map_data import PACE_LEAST, PACE_MOST, DigestRows
 
@@ -34,7 +19,7 @@ MOST_ZONES = 1000
 ZoneName = Annotated[str, Meta(max_length=40)]
 """Empty where none is given."""
 _ZONE_NAME = re.compile(r"[A-Za-z0-9_-]{1,40}")
-Corners = Annotated[list[tuple[Metres, Metres]], Meta(max_length=MOST_CORNERS)]
+Corners = Annotated[list[tuple[fields.Metres, fields.Metres]], Meta(max_length=MOST_CORNERS)]
 PlaceText = Annotated[str, Meta(max_length=80)]
 """A place as `swarm.places` reads it: "46.81,9.84" (latitude, longitude), "xy:X,Y" in metres of the map."""
 _Pace = Annotated[float, Meta(ge=PACE_LEAST, le=PACE_MOST)]
@@ -64,8 +49,8 @@ class ZoneOrder(Message, frozen=True, kw_only=True, tag=schema_of("zone-order"))
     polygon_m: Corners = []
     lasts_s: _Seconds | None = None
     corners: Annotated[list[PlaceText], Meta(max_length=MOST_CORNERS)] = []
-    vehicle_class: Id | None = None
-    stamp_ns: StampNs = 0
+    vehicle_class: fields.Id | None = None
+    stamp_ns: fields.StampNs = 0
     holes: Annotated[list[Corners], Meta(max_length=MOST_CORNERS // 3)] = []
 
     @property
@@ -101,7 +86,7 @@ def _check_place(name: str, place: str) -> None:
         raise ValueError(str(error)) from None
 
 
-class Zone(Bounded, frozen=True, kw_only=True):
+class Zone(fields.Bounded, frozen=True, kw_only=True):
     """A zone that stands.
 
     pace_s_per_m  None of a lethal zone
@@ -111,13 +96,13 @@ class Zone(Bounded, frozen=True, kw_only=True):
     vehicle_class  for whom it is; None: for all
     """
 
-    name: Id
+    name: fields.Id
     kind: Literal["lethal", "pace"]
     pace_s_per_m: _Pace | None
-    cells: Count
-    window: Annotated[list[CellIndex], Meta(min_length=4, max_length=4)]
-    until_ns: StampNs | None
-    vehicle_class: Id | None = None
+    cells: fields.Count
+    window: Annotated[list[fields.CellIndex], Meta(min_length=4, max_length=4)]
+    until_ns: fields.StampNs | None
+    vehicle_class: fields.Id | None = None
 
 
 class Zones(Message, frozen=True, kw_only=True, tag=schema_of("zones")):
@@ -127,7 +112,7 @@ class Zones(Message, frozen=True, kw_only=True, tag=schema_of("zones")):
              process that holds these obeys
     """
 
-    keeper: Id
+    keeper: fields.Id
     zones: Annotated[list[Zone], Meta(max_length=MOST_ZONES)]
     changed: ZoneName = ""
     sets: DigestRows = b""
@@ -138,13 +123,13 @@ SimulatedWalk = Literal["still", "random", "waypoints", "evade"]
 _Name = Annotated[str, Meta(max_length=64)]
 """Empty of a pause, else an id or the key of a setting."""
 _Speed = Annotated[float, Meta(ge=0, le=1e4)]
-_Targets = Annotated[list[Id], IDS]
+_Targets = Annotated[list[fields.Id], fields.IDS]
 _WALK: SimulatedWalk = "waypoints"
 _SPEED_M_PER_S = 4.0
 """Range of speeds as for targets of a scenario."""
 
 
-class Order(Bounded, frozen=True, kw_only=True):
+class Order(fields.Bounded, frozen=True, kw_only=True):
     """The last order about one subject.
 
     name      of the vehicle, group, target or setting
@@ -159,18 +144,18 @@ class Order(Bounded, frozen=True, kw_only=True):
 
     subject: Subject
     name: _Name
-    stamp_ns: StampNs
+    stamp_ns: fields.StampNs
     off: bool = False
     targets: _Targets = []
-    value: Gauge | None = None
-    cell: CellIndex | None = None
+    value: fields.Gauge | None = None
+    cell: fields.CellIndex | None = None
     walk: SimulatedWalk = _WALK
     speed_m_per_s: _Speed = _SPEED_M_PER_S
     added: bool = False
 
     def relate(self) -> None:
         if self.name:
-            check_id("name", self.name)
+            fields.check_id("name", self.name)
 
 
 class GiveOrder(Message, frozen=True, kw_only=True, tag=schema_of("give-order")):
@@ -187,15 +172,15 @@ class GiveOrder(Message, frozen=True, kw_only=True, tag=schema_of("give-order"))
     name: _Name = ""
     off: bool = False
     targets: _Targets = []
-    value: Gauge | None = None
-    cell: CellIndex | None = None
-    row: Cell | None = None
-    col: Cell | None = None
+    value: fields.Gauge | None = None
+    cell: fields.CellIndex | None = None
+    row: fields.Cell | None = None
+    col: fields.Cell | None = None
     walk: SimulatedWalk = _WALK
     speed_m_per_s: _Speed = _SPEED_M_PER_S
     new: bool = False
     at: PlaceText = ""
-    stamp_ns: StampNs = 0
+    stamp_ns: fields.StampNs = 0
 
     @property
     def changes(self) -> bool:
@@ -204,7 +189,7 @@ class GiveOrder(Message, frozen=True, kw_only=True, tag=schema_of("give-order"))
 
     def relate(self) -> None:
         if self.name:
-            check_id("name", self.name)
+            fields.check_id("name", self.name)
         elif self.subject not in (None, "pause"):
             raise ValueError(f"name is missing: which {self.subject} is it about?")
         places = (self.row is not None) + (self.cell is not None) + bool(self.at)
@@ -222,8 +207,8 @@ class Orders(Message, frozen=True, kw_only=True, tag=schema_of("orders")):
     given  the order that this answers, if it answers one
     """
 
-    role: Id
-    id: Id
+    role: fields.Id
+    id: fields.Id
     orders: Annotated[list[Order], Meta(max_length=2000)]
     given: Order | None = None
 
@@ -233,7 +218,7 @@ MOST_GOALS = 64
 Then = Literal["hold", "chase", "repeat"]
 
 
-class VehicleGoals(Bounded, frozen=True, kw_only=True):
+class VehicleGoals(fields.Bounded, frozen=True, kw_only=True):
     """The places to which a vehicle was sent last.
 
     name      of the vehicle
@@ -244,12 +229,12 @@ class VehicleGoals(Bounded, frozen=True, kw_only=True):
     done      how many it has reached, laps included
     """
 
-    name: VehicleId
-    stamp_ns: StampNs
+    name: fields.VehicleId
+    stamp_ns: fields.StampNs
     off: bool = False
-    cells: Annotated[list[CellIndex], Meta(max_length=MOST_GOALS)] = []
+    cells: Annotated[list[fields.CellIndex], Meta(max_length=MOST_GOALS)] = []
     then: Then = "hold"
-    done: Count = 0
+    done: fields.Count = 0
 
     def relate(self) -> None:
         if self.off == bool(self.cells):
@@ -270,7 +255,7 @@ class SendVehicle(Message, frozen=True, kw_only=True, tag=schema_of("send-vehicl
     places: Annotated[list[PlaceText], Meta(max_length=MOST_GOALS)] = []
     then: Then = "hold"
     off: bool = False
-    stamp_ns: StampNs = 0
+    stamp_ns: fields.StampNs = 0
 
     @property
     def changes(self) -> bool:
@@ -279,7 +264,7 @@ class SendVehicle(Message, frozen=True, kw_only=True, tag=schema_of("send-vehicl
 
     def relate(self) -> None:
         if self.vehicle:
-            check_id("vehicle", self.vehicle)
+            fields.check_id("vehicle", self.vehicle)
         if bool(self.places) != (self.changes and not self.off):
             raise ValueError("places is empty: where is the vehicle to go?" if not self.off else "places with off")
         for place in self.places:
@@ -295,17 +280,17 @@ class Goals(Message, frozen=True, kw_only=True, tag=schema_of("goals")):
     given   the order that this answers, if it answers one
     """
 
-    id: Id
-    agent: Id | None = None
-    goals: Annotated[list[VehicleGoals], IDS]
-    shared: Annotated[list[tuple[CellIndex, Count]], LARGE] = []
+    id: fields.Id
+    agent: fields.Id | None = None
+    goals: Annotated[list[VehicleGoals], fields.IDS]
+    shared: Annotated[list[tuple[fields.CellIndex, fields.Count]], fields.LARGE] = []
     given: VehicleGoals | None = None
 
 
 GoalStateName = Literal["queued", "underway", "delayed", "blocked", "standby", "completed", "canceled", "failed"]
 
 
-class GoalState(Bounded, frozen=True, kw_only=True):
+class GoalState(fields.Bounded, frozen=True, kw_only=True):
     """Progress of a vehicle along the places of one order. The states are those of tasks in Open-RMF.
 
     name      of the vehicle
@@ -318,20 +303,20 @@ class GoalState(Bounded, frozen=True, kw_only=True):
     reason    why it is blocked
     """
 
-    name: VehicleId
-    stamp_ns: StampNs
-    done: Count
+    name: fields.VehicleId
+    stamp_ns: fields.StampNs
+    done: fields.Count
     state: GoalStateName
-    cell: CellIndex | None = None
-    reason: Word = ""
+    cell: fields.CellIndex | None = None
+    reason: fields.Word = ""
 
 
 class GoalStates(Message, frozen=True, kw_only=True, tag=schema_of("goal-states")):
     """The states of all vehicles of an agent that were sent somewhere."""
 
-    agent: Id
-    stamp_ns: StampNs
-    states: Annotated[list[GoalState], IDS]
+    agent: fields.Id
+    stamp_ns: fields.StampNs
+    states: Annotated[list[GoalState], fields.IDS]
 
     def relate(self) -> None:
         strange = next((each.name for each in self.states if not each.name.startswith(f"{self.agent}-")), None)
@@ -347,21 +332,21 @@ class Obey(Message, frozen=True, kw_only=True, tag=schema_of("obey")):
     goals                    the order is about the goals of the vehicle of that name
     """
 
-    author: Word = ""
+    author: fields.Word = ""
     sets: DigestRows = b""
     subject: Subject | None = None
     name: _Name = ""
-    stamp_ns: StampNs = 0
+    stamp_ns: fields.StampNs = 0
     goals: bool = False
 
     def relate(self) -> None:
         if self.author or self.sets:
-            check_id("author", self.author)
+            fields.check_id("author", self.author)
 
 
 class Obeyed(Message, frozen=True, kw_only=True, tag=schema_of("obeyed")):
     """Acknowledgement of a process that it obeys."""
 
-    role: Id
-    id: Id
-    incarnation: Incarnation
+    role: fields.Id
+    id: fields.Id
+    incarnation: fields.Incarnation

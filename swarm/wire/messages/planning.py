@@ -7,27 +7,7 @@ from typing import Annotated, Literal
 
 from msgspec import Meta
 
-from swarm.wire.fields import (
-    LARGE,
-    SMALL,
-    AgeMillis,
-    AgeSeconds,
-    Cell,
-    Column,
-    Count,
-    Distance,
-    Gap,
-    GridSide,
-    Id,
-    Incarnation,
-    LeaseSeconds,
-    Metres,
-    Millis,
-    Natural,
-    StampNs,
-    VehicleId,
-    Word,
-)
+from swarm.wire import fields
 from swarm.wire.messages import Message, schema_of
 from swarm.wire.route_columns import Route, Routes
 
@@ -46,13 +26,13 @@ class RouteRequest(Message, frozen=True, kw_only=True, tag=schema_of("route-requ
     vehicle_class  class of the vehicles; each class has its own tree, so its own routes
     """
 
-    cells: Annotated[list[Cell], LARGE] = []
-    vehicles: Annotated[list[VehicleId], SMALL] = []
-    max_cells: Count = 0
+    cells: Annotated[list[fields.Cell], fields.LARGE] = []
+    vehicles: Annotated[list[fields.VehicleId], fields.SMALL] = []
+    max_cells: fields.Count = 0
     force: bool = False
-    row: Cell | None = None
-    col: Cell | None = None
-    vehicle_class: Id = GROUND
+    row: fields.Cell | None = None
+    col: fields.Cell | None = None
+    vehicle_class: fields.Id = GROUND
 
     def relate(self) -> None:
         if self.vehicles and len(self.vehicles) != len(self.cells):
@@ -74,19 +54,19 @@ class RouteReply(Message, frozen=True, kw_only=True, tag=schema_of("route")):
     nearest_cell   the cell nearest to it which can be reached; None if none is near
     """
 
-    target: Id
-    incarnation: Incarnation
-    target_cell: Cell | None
-    map_version: Count
-    tree_age_ms: AgeMillis
-    rows: GridSide
-    cols: GridSide
+    target: fields.Id
+    incarnation: fields.Incarnation
+    target_cell: fields.Cell | None
+    map_version: fields.Count
+    tree_age_ms: fields.AgeMillis
+    rows: fields.GridSide
+    cols: fields.GridSide
     routes: Routes
-    pose_age_s: AgeSeconds | None = None
+    pose_age_s: fields.AgeSeconds | None = None
     tracker_lost: bool = False
-    vehicle_class: Id = GROUND
-    lethal_target: Cell | None = None
-    nearest_cell: Cell | None = None
+    vehicle_class: fields.Id = GROUND
+    lethal_target: fields.Cell | None = None
+    nearest_cell: fields.Cell | None = None
 
     def check(self) -> None:
         self.routes.check_bounds()
@@ -98,11 +78,11 @@ class PlaceRouteRequest(Message, frozen=True, kw_only=True, tag=schema_of("place
     to  the cell of the place
     """
 
-    to: Cell
-    cells: Annotated[list[Cell], LARGE] = []
-    vehicles: Annotated[list[VehicleId], SMALL] = []
-    max_cells: Count = 0
-    vehicle_class: Id = GROUND
+    to: fields.Cell
+    cells: Annotated[list[fields.Cell], fields.LARGE] = []
+    vehicles: Annotated[list[fields.VehicleId], fields.SMALL] = []
+    max_cells: fields.Count = 0
+    vehicle_class: fields.Id = GROUND
 
 
 PlaceStatus = Literal["ok", "growing", "lethal_goal", "outside_goal"]
@@ -117,12 +97,12 @@ class PlaceRouteReply(Message, frozen=True, kw_only=True, tag=schema_of("place-r
                  status is NO_TARGET: ask again
     """
 
-    to_cell: Cell
-    incarnation: Incarnation
-    map_version: Count
+    to_cell: fields.Cell
+    incarnation: fields.Incarnation
+    map_version: fields.Count
     routes: Routes
     status: PlaceStatus = "ok"
-    vehicle_class: Id = GROUND
+    vehicle_class: fields.Id = GROUND
 
     def check(self) -> None:
         self.routes.check_bounds()
@@ -135,21 +115,21 @@ class PushedRoute(Message, frozen=True, kw_only=True, tag=schema_of("pushed-rout
     target_cell  of the target or of the place
     """
 
-    vehicle: VehicleId
-    target: Id | None
-    incarnation: Incarnation
-    target_cell: Cell
-    map_version: Count
+    vehicle: fields.VehicleId
+    target: fields.Id | None
+    incarnation: fields.Incarnation
+    target_cell: fields.Cell
+    map_version: fields.Count
     route: Route
 
 
 class CostRequest(Message, frozen=True, kw_only=True, tag=schema_of("cost-request")):
     """Asks what it costs to reach the planner's target from each of these cells, in a vehicle of a class."""
 
-    cells: Annotated[list[Cell], LARGE] = []
-    row: Cell | None = None
-    col: Cell | None = None
-    vehicle_class: Id = GROUND
+    cells: Annotated[list[fields.Cell], fields.LARGE] = []
+    row: fields.Cell | None = None
+    col: fields.Cell | None = None
+    vehicle_class: fields.Id = GROUND
 
     def relate(self) -> None:
         if (self.row is None) != (self.col is None):
@@ -160,17 +140,17 @@ class CostReply(Message, frozen=True, kw_only=True, tag=schema_of("cost")):
     """A planner's answer: `cost_to_go_s` per asked cell, inf where there is no way or the cell is outside. Else as
     `RouteReply`."""
 
-    target: Id
-    incarnation: Incarnation
-    target_cell: Cell | None
-    map_version: Count
-    tree_age_ms: AgeMillis
-    cost_to_go_s: Annotated[bytes, Meta(max_length=4 * 100_001), Column("<f4", least=0, most=math.inf)]
-    pose_age_s: AgeSeconds | None = None
+    target: fields.Id
+    incarnation: fields.Incarnation
+    target_cell: fields.Cell | None
+    map_version: fields.Count
+    tree_age_ms: fields.AgeMillis
+    cost_to_go_s: Annotated[bytes, Meta(max_length=4 * 100_001), fields.Column("<f4", least=0, most=math.inf)]
+    pose_age_s: fields.AgeSeconds | None = None
     tracker_lost: bool = False
-    vehicle_class: Id = GROUND
-    lethal_target: Cell | None = None
-    nearest_cell: Cell | None = None
+    vehicle_class: fields.Id = GROUND
+    lethal_target: fields.Cell | None = None
+    nearest_cell: fields.Cell | None = None
 
 
 MOST_BELIEVED = 512
@@ -186,12 +166,12 @@ class Believed(Message, frozen=True, kw_only=True, tag=schema_of("believed")):
     shares  probability of each
     """
 
-    target: Id
-    incarnation: Incarnation
-    stamp_ns: StampNs
-    side_m: Distance
-    cells: Annotated[list[Cell], Meta(max_length=MOST_BELIEVED)]
-    shares: Annotated[bytes, Column("<f4", per="cells", least=0, most=1)]
+    target: fields.Id
+    incarnation: fields.Incarnation
+    stamp_ns: fields.StampNs
+    side_m: fields.Distance
+    cells: Annotated[list[fields.Cell], Meta(max_length=MOST_BELIEVED)]
+    shares: Annotated[bytes, fields.Column("<f4", per="cells", least=0, most=1)]
 
 
 class PlannerStatus(Message, frozen=True, kw_only=True, tag=schema_of("planner-status")):
@@ -202,25 +182,25 @@ class PlannerStatus(Message, frozen=True, kw_only=True, tag=schema_of("planner-s
     gap_*    driven cost over optimum of the vehicles that follow, at the last full growth; None before the first
     """
 
-    target: Id
-    incarnation: Incarnation
-    stamp_ns: StampNs
-    strategy: Word
-    target_cell: Cell | None
-    map_version: Count
-    tree_age_ms: AgeMillis
-    window: Annotated[list[Cell], Meta(max_length=4)]
-    growths: Count
-    window_growths: Count
-    growth_ms: Millis
-    routes_served: Count
-    following: Count
-    tracker: Id | None = None
-    pose_age_s: AgeSeconds | None = None
+    target: fields.Id
+    incarnation: fields.Incarnation
+    stamp_ns: fields.StampNs
+    strategy: fields.Word
+    target_cell: fields.Cell | None
+    map_version: fields.Count
+    tree_age_ms: fields.AgeMillis
+    window: Annotated[list[fields.Cell], Meta(max_length=4)]
+    growths: fields.Count
+    window_growths: fields.Count
+    growth_ms: fields.Millis
+    routes_served: fields.Count
+    following: fields.Count
+    tracker: fields.Id | None = None
+    pose_age_s: fields.AgeSeconds | None = None
     tracker_lost: bool = False
-    gap_mean: Gap | None = None
-    gap_p95: Gap | None = None
-    gap_max: Gap | None = None
+    gap_mean: fields.Gap | None = None
+    gap_p95: fields.Gap | None = None
+    gap_max: fields.Gap | None = None
 
     def relate(self) -> None:
         if len(self.window) not in (0, 4):
@@ -246,30 +226,30 @@ class TargetPose(Message, frozen=True, kw_only=True, tag=schema_of("pose")):
     jumps        how often it was put somewhere else, as after a capture
     """
 
-    target: Id
-    tracker: Id | None = None
-    incarnation: Incarnation
-    seq: Natural
-    lease_s: LeaseSeconds = POSE_LEASE_S
-    stamp_ns: StampNs
-    cell: Cell = CELL_OF_PLACE
-    x_m: Metres
-    y_m: Metres
-    captures: Count = 0
-    jumps: Count = 0
+    target: fields.Id
+    tracker: fields.Id | None = None
+    incarnation: fields.Incarnation
+    seq: fields.Natural
+    lease_s: fields.LeaseSeconds = POSE_LEASE_S
+    stamp_ns: fields.StampNs
+    cell: fields.Cell = CELL_OF_PLACE
+    x_m: fields.Metres
+    y_m: fields.Metres
+    captures: fields.Count = 0
+    jumps: fields.Count = 0
 
 
 class Sighted(Message, frozen=True, kw_only=True, tag=schema_of("sighted")):
     """A sighting: a vehicle of this author saw a target within `uncertainty_m` of the place. It expires at
     `until_ns`, and the author's next sighting of the target replaces it."""
 
-    author: Id
-    group: Id
-    target: Id
-    seq: Natural
-    stamp_ns: StampNs
-    until_ns: StampNs
-    cell: Cell
-    x_m: Metres
-    y_m: Metres
-    uncertainty_m: Distance
+    author: fields.Id
+    group: fields.Id
+    target: fields.Id
+    seq: fields.Natural
+    stamp_ns: fields.StampNs
+    until_ns: fields.StampNs
+    cell: fields.Cell
+    x_m: fields.Metres
+    y_m: fields.Metres
+    uncertainty_m: fields.Distance

@@ -8,26 +8,7 @@ import msgspec
 from msgspec import Meta
 
 from swarm.grid import REGION_CELLS
-from swarm.wire.fields import (
-    IDS,
-    MOST_IDS,
-    SMALL,
-    Bucket,
-    CellIndex,
-    Count,
-    Distance,
-    Gauge,
-    GridSideOrNone,
-    Id,
-    Incarnation,
-    LongText,
-    Metres,
-    Natural,
-    StampNs,
-    Text,
-    WebPort,
-    Word,
-)
+from swarm.wire import fields
 from swarm.wire.messages import Message, schema_of
 
 
@@ -47,26 +28,26 @@ class RunInfo(Message, frozen=True, kw_only=True, tag=schema_of("run")):
     shard_cells               side of a shard of right of way: two layouts in one run would grant a cell twice
     """
 
-    run_id: Word
-    role: Id
-    id: Id
-    incarnation: Incarnation
-    scenario: Word
-    terrain: Word
-    rows: GridSideOrNone
-    cols: GridSideOrNone
-    resolution_m: Distance
-    started_ns: StampNs
-    west_m: Metres = 0.0
-    north_m: Metres = 0.0
-    crs: LongText = "local"
-    now_ns: StampNs = 0
-    vehicles: Count = 0
-    crew: Annotated[list[Word], Meta(max_length=MOST_IDS)] = []
-    restarts: Count = 0
-    classes: Annotated[list[Id], IDS] = []
-    wire_version: Count = 8
-    shard_cells: Count = REGION_CELLS
+    run_id: fields.Word
+    role: fields.Id
+    id: fields.Id
+    incarnation: fields.Incarnation
+    scenario: fields.Word
+    terrain: fields.Word
+    rows: fields.GridSideOrNone
+    cols: fields.GridSideOrNone
+    resolution_m: fields.Distance
+    started_ns: fields.StampNs
+    west_m: fields.Metres = 0.0
+    north_m: fields.Metres = 0.0
+    crs: fields.LongText = "local"
+    now_ns: fields.StampNs = 0
+    vehicles: fields.Count = 0
+    crew: Annotated[list[fields.Word], Meta(max_length=fields.MOST_IDS)] = []
+    restarts: fields.Count = 0
+    classes: Annotated[list[fields.Id], fields.IDS] = []
+    wire_version: fields.Count = 8
+    shard_cells: fields.Count = REGION_CELLS
 
 
 class Alarm(msgspec.Struct, frozen=True, kw_only=True):
@@ -77,13 +58,13 @@ class Alarm(msgspec.Struct, frozen=True, kw_only=True):
     since_ns  when it began; over_ns when it was over, None while it lasts
     """
 
-    kind: Word
-    about: Word
-    text: Text
-    since_ns: StampNs
-    over_ns: StampNs | None = None
-    cell: CellIndex | None = None
-    target: Id | None = None
+    kind: fields.Word
+    about: fields.Word
+    text: fields.Text
+    since_ns: fields.StampNs
+    over_ns: fields.StampNs | None = None
+    cell: fields.CellIndex | None = None
+    target: fields.Id | None = None
 
 
 class Stats(Message, frozen=True, kw_only=True, tag=schema_of("stats")):
@@ -95,21 +76,30 @@ class Stats(Message, frozen=True, kw_only=True, tag=schema_of("stats")):
     web_port                    port of its own machine where people can look at it in a browser; 0: none
     """
 
-    role: Id
-    id: Id
-    incarnation: Incarnation
-    stamp_ns: StampNs
-    counts: Annotated[dict[Word, Count], SMALL]
-    gauges: Annotated[dict[Word, Gauge], SMALL]
-    histograms: Annotated[dict[Word, Annotated[dict[Bucket, Count], Meta(max_length=40_000)]], SMALL]
-    counts_by: Annotated[dict[Word, Annotated[dict[Id, Count], IDS]], Meta(max_length=16)] = {}
+    role: fields.Id
+    id: fields.Id
+    incarnation: fields.Incarnation
+    stamp_ns: fields.StampNs
+    counts: Annotated[dict[fields.Word, fields.Count], fields.SMALL]
+    gauges: Annotated[dict[fields.Word, fields.Gauge], fields.SMALL]
+    histograms: Annotated[
+        dict[fields.Word, Annotated[dict[fields.Bucket, fields.Count], Meta(max_length=40_000)]], fields.SMALL
+    ]
+    counts_by: Annotated[
+        dict[fields.Word, Annotated[dict[fields.Id, fields.Count], fields.IDS]], Meta(max_length=16)
+    ] = {}
     histograms_by: Annotated[
-        dict[Word, Annotated[dict[Id, Annotated[dict[Bucket, Count], Meta(max_length=40_000)]], IDS]],
+        dict[
+            fields.Word,
+            Annotated[
+                dict[fields.Id, Annotated[dict[fields.Bucket, fields.Count], Meta(max_length=40_000)]], fields.IDS
+            ],
+        ],
         Meta(max_length=16),
     ] = {}
-    since: Incarnation = 0
+    since: fields.Incarnation = 0
     alarms: Annotated[list[Alarm], Meta(max_length=64)] = []
-    web_port: WebPort = 0
+    web_port: fields.WebPort = 0
 
 
 class Heartbeat(Message, frozen=True, kw_only=True, tag=schema_of("beat")):
@@ -117,23 +107,23 @@ class Heartbeat(Message, frozen=True, kw_only=True, tag=schema_of("beat")):
     does. `seq`: number in its sender's life; only a greater one counts. `heard`: incarnations whose heartbeats its
     sender has received."""
 
-    role: Id
-    id: Id
-    incarnation: Incarnation
+    role: fields.Id
+    id: fields.Id
+    incarnation: fields.Incarnation
     ready: bool
     leads: bool
-    seq: Natural
-    heard: Annotated[list[Incarnation], Meta(max_length=64)] = []
+    seq: fields.Natural
+    heard: Annotated[list[fields.Incarnation], Meta(max_length=64)] = []
 
 
 class Note(Message, frozen=True, kw_only=True, tag=schema_of("note")):
     """An event for people: a capture, a restart, a closed road found. `cell` is its place, if it has one, `target`
     the target that it is about."""
 
-    role: Id
-    id: Id
-    stamp_ns: StampNs
-    kind: Word
-    text: Text
-    cell: CellIndex | None = None
-    target: Id | None = None
+    role: fields.Id
+    id: fields.Id
+    stamp_ns: fields.StampNs
+    kind: fields.Word
+    text: fields.Text
+    cell: fields.CellIndex | None = None
+    target: fields.Id | None = None

@@ -12,27 +12,14 @@ from msgspec import Meta
 from msgspec.structs import replace
 
 from swarm.grid import MOST_SHARD_REGIONS, REGION_CELLS
-from swarm.wire.fields import (
-    IDS,
-    LARGE,
-    MOST_IDS,
-    MOST_LARGE,
-    SMALL,
-    Bounded,
-    Cell,
-    Id,
-    Natural,
-    Part,
-    Shard,
-    VehicleId,
-)
+from swarm.wire import fields
 from swarm.wire.messages import Message, schema_of
 
-Stamp = tuple[Natural, Natural]
+Stamp = tuple[fields.Natural, fields.Natural]
 """(epoch, seq): which table of a shard. Later ones compare greater."""
-Number = tuple[Cell, Natural, Natural]
+Number = tuple[fields.Cell, fields.Natural, fields.Natural]
 """(cell, epoch, seq): an entry in the order of vehicles for a cell, by the table that added it."""
-Before = tuple[Natural, Natural, VehicleId]
+Before = tuple[fields.Natural, fields.Natural, fields.VehicleId]
 """(epoch, seq, vehicle) of another entry of the same cell."""
 _MOST_CELLS = 1 << 32
 """Cells of the largest grid; as those of a `Cell`, the cells of an entry may lie outside the grid."""
@@ -53,9 +40,9 @@ class Held(msgspec.Struct, frozen=True, array_like=True):
     stamps  (epoch, seq, count): the tables which added the entries, each with the number of entries in turn
     """
 
-    first: Cell = 0
+    first: fields.Cell = 0
     turns: Annotated[list[_Turn], Meta(max_length=63)] = []
-    stamps: Annotated[list[tuple[Natural, Natural, _Run]], Meta(max_length=64)] = []
+    stamps: Annotated[list[tuple[fields.Natural, fields.Natural, _Run]], Meta(max_length=64)] = []
 
     @classmethod
     def of(cls, numbers: Sequence[Number]) -> Held:
@@ -95,7 +82,7 @@ class Held(msgspec.Struct, frozen=True, array_like=True):
 _NONE_HELD = Held()
 
 
-class Stand(Part, frozen=True, array_like=True):
+class Stand(fields.Part, frozen=True, array_like=True):
     """One vehicle, as its host tells it to the members of one shard.
 
     cell    where it stands, and `end` where what it holds ends; both may lie in another shard
@@ -107,12 +94,12 @@ class Stand(Part, frozen=True, array_like=True):
     keeps   how many cells ahead it keeps: its host gives back those further on once a vehicle waits for them
     """
 
-    vehicle: VehicleId
-    cell: Cell
-    end: Cell
+    vehicle: fields.VehicleId
+    cell: fields.Cell
+    end: fields.Cell
     holds: Held
-    ahead: Annotated[list[Cell], Meta(max_length=16)]
-    wants: Annotated[list[Cell], Meta(max_length=8)]
+    ahead: Annotated[list[fields.Cell], Meta(max_length=16)]
+    wants: Annotated[list[fields.Cell], Meta(max_length=8)]
     better: Annotated[int, Meta(ge=0, le=8)]
     age_ms: Milliseconds
     keeps: Annotated[int, Meta(ge=0, le=16)] = 16
@@ -132,15 +119,15 @@ class HostState(Message, frozen=True, kw_only=True, tag=schema_of("host-state", 
     never       entries later than `knows` that this start does not hold, and never takes: members asked for them
     """
 
-    shard: Shard
-    agent: Id
-    generation: Natural
-    seq: Natural
+    shard: fields.Shard
+    agent: fields.Id
+    generation: fields.Natural
+    seq: fields.Natural
     knows: Stamp
-    vehicles: Annotated[list[Stand], SMALL]
-    dead: Annotated[list[Natural], Meta(max_length=32)] = []
+    vehicles: Annotated[list[Stand], fields.SMALL]
+    dead: Annotated[list[fields.Natural], Meta(max_length=32)] = []
     ended: bool = False
-    never: Annotated[list[Number], SMALL] = []
+    never: Annotated[list[Number], fields.SMALL] = []
 
 
 class Entry(msgspec.Struct, frozen=True, array_like=True):
@@ -163,12 +150,12 @@ def entries_of(held: Iterable[Number], waits: Iterable[Entry]) -> list[Entry]:
     return [waiting.get(number) or Entry(number) for number in held]
 
 
-class Fence(Bounded, frozen=True, array_like=True):
+class Fence(fields.Bounded, frozen=True, array_like=True):
     """The entries of an earlier generation of a host, on which its vehicles may still be."""
 
-    agent: Id
-    generation: Natural
-    entries: Annotated[dict[VehicleId, Held], LARGE]
+    agent: fields.Id
+    generation: fields.Natural
+    entries: Annotated[dict[fields.VehicleId, Held], fields.LARGE]
 
 
 class Table(Message, frozen=True, kw_only=True, tag=schema_of("table", 9)):
@@ -185,15 +172,15 @@ class Table(Message, frozen=True, kw_only=True, tag=schema_of("table", 9)):
             empty one for a vehicle that has no entry any more. None if the table is whole
     """
 
-    shard: Shard
-    agent: Id
-    epoch: Natural
-    seq: Natural
-    hosts: Annotated[dict[Id, tuple[Natural, Natural]], IDS]
-    grants: Annotated[dict[VehicleId, Held], LARGE]
-    fences: Annotated[list[Fence], IDS] = []
-    pushed: Annotated[dict[VehicleId, Milliseconds], LARGE] = {}
-    without: Annotated[dict[Id, Natural], IDS] = {}
+    shard: fields.Shard
+    agent: fields.Id
+    epoch: fields.Natural
+    seq: fields.Natural
+    hosts: Annotated[dict[fields.Id, tuple[fields.Natural, fields.Natural]], fields.IDS]
+    grants: Annotated[dict[fields.VehicleId, Held], fields.LARGE]
+    fences: Annotated[list[Fence], fields.IDS] = []
+    pushed: Annotated[dict[fields.VehicleId, Milliseconds], fields.LARGE] = {}
+    without: Annotated[dict[fields.Id, fields.Natural], fields.IDS] = {}
     since: Stamp | None = None
 
     @property
@@ -215,17 +202,17 @@ class Table(Message, frozen=True, kw_only=True, tag=schema_of("table", 9)):
         for vehicle, held in self.grants.items():
             if not held.stamps:
                 del grants[vehicle]
-        fits = len(hosts) <= MOST_IDS and len(grants) <= MOST_LARGE
+        fits = len(hosts) <= fields.MOST_IDS and len(grants) <= fields.MOST_LARGE
         return replace(self, hosts=hosts, grants=grants, since=None) if fits else None
 
 
 class Stored(Message, frozen=True, kw_only=True, tag=schema_of("stored")):
     """A member of a shard has the table of this stamp on file."""
 
-    shard: Shard
-    agent: Id
-    epoch: Natural
-    seq: Natural
+    shard: fields.Shard
+    agent: fields.Id
+    epoch: fields.Natural
+    seq: fields.Natural
 
 
 class Granted(Message, frozen=True, kw_only=True, tag=schema_of("granted", 9)):
@@ -241,18 +228,18 @@ class Granted(Message, frozen=True, kw_only=True, tag=schema_of("granted", 9)):
     occupied           cells held by others near the ends of this host's paths
     """
 
-    shard: Shard
-    host: Id
-    agent: Id
-    epoch: Natural
-    seq: Natural
-    generation: Natural
-    heard: Natural
-    grants: Annotated[dict[VehicleId, Held], SMALL] = {}
-    waits: Annotated[dict[VehicleId, Annotated[list[Entry], Meta(max_length=64)]], SMALL] = {}
-    followed: Annotated[dict[Id, Annotated[list[Number], SMALL]], IDS] = {}
-    pushed: Annotated[dict[VehicleId, Milliseconds], SMALL] = {}
-    occupied: Annotated[list[Cell], LARGE] = []
+    shard: fields.Shard
+    host: fields.Id
+    agent: fields.Id
+    epoch: fields.Natural
+    seq: fields.Natural
+    generation: fields.Natural
+    heard: fields.Natural
+    grants: Annotated[dict[fields.VehicleId, Held], fields.SMALL] = {}
+    waits: Annotated[dict[fields.VehicleId, Annotated[list[Entry], Meta(max_length=64)]], fields.SMALL] = {}
+    followed: Annotated[dict[fields.Id, Annotated[list[Number], fields.SMALL]], fields.IDS] = {}
+    pushed: Annotated[dict[fields.VehicleId, Milliseconds], fields.SMALL] = {}
+    occupied: Annotated[list[fields.Cell], fields.LARGE] = []
 
     @property
     def stamp(self) -> Stamp:
@@ -270,12 +257,12 @@ class Word(Message, frozen=True, kw_only=True, tag=schema_of("word")):
     lacks       entries of the host that such a table omits: the host disclaims those that it does not hold
     """
 
-    shard: Shard
-    host: Id
-    agent: Id
-    epoch: Natural
-    seq: Natural
-    part: Natural
+    shard: fields.Shard
+    host: fields.Id
+    agent: fields.Id
+    epoch: fields.Natural
+    seq: fields.Natural
+    part: fields.Natural
     asks: bool = False
     lacks: Annotated[list[Number], Meta(max_length=64)] = []
 
@@ -284,16 +271,16 @@ class Left(Message, frozen=True, kw_only=True, tag=schema_of("left")):
     """Entries that vehicles of a host have left or given back, for a host whose vehicles wait behind them: a fact
     for good, so no order, loss or repetition matters."""
 
-    agent: Id
-    host: Id
-    entries: Annotated[list[Number], SMALL]
+    agent: fields.Id
+    host: fields.Id
+    entries: Annotated[list[Number], fields.SMALL]
 
 
 class Claim(Message, frozen=True, kw_only=True, tag=schema_of("claim")):
     """A member requests to be leader in this epoch: a member that replies with its stored table promises to store
     none of a lower epoch."""
 
-    epoch: Natural
+    epoch: fields.Natural
 
 
 class KnownRequest(Message, frozen=True, kw_only=True, tag=schema_of("known-request")):
@@ -301,8 +288,8 @@ class KnownRequest(Message, frozen=True, kw_only=True, tag=schema_of("known-requ
     file that it keeps; an external vehicle's is 0, and is not noted. Only agents of its layer answer: 0 is the
     ground, 1 the air; an agent is answered only by those whose shards are as large as its own."""
 
-    agent: Id
-    disk: Natural
+    agent: fields.Id
+    disk: fields.Natural
     layer: Annotated[int, Meta(ge=0, le=1)] = 0
     shard_cells: ShardSide = REGION_CELLS
 
@@ -321,10 +308,10 @@ class Known(Message, frozen=True, kw_only=True, tag=schema_of("known")):
     shard_cells  side of a shard
     """
 
-    agent: Id
-    disk: Natural
-    generation: Natural
-    shards: Annotated[list[Shard], LARGE]
-    agents: Annotated[list[Id], IDS] = []
-    generations: Annotated[list[Natural], Meta(max_length=32)] = []
+    agent: fields.Id
+    disk: fields.Natural
+    generation: fields.Natural
+    shards: Annotated[list[fields.Shard], fields.LARGE]
+    agents: Annotated[list[fields.Id], fields.IDS] = []
+    generations: Annotated[list[fields.Natural], Meta(max_length=32)] = []
     shard_cells: ShardSide = REGION_CELLS

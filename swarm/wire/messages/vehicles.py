@@ -8,25 +8,7 @@ from typing import Annotated
 
 from msgspec import Meta
 
-from swarm.wire.fields import (
-    MOST_VEHICLES,
-    SMALL,
-    Cell,
-    Column,
-    Count,
-    Directions,
-    Distance,
-    FiniteCost,
-    Id,
-    Incarnation,
-    Legs,
-    Metres,
-    Natural,
-    Region,
-    StampNs,
-    VehicleId,
-    check_column,
-)
+from swarm.wire import fields
 from swarm.wire.messages import Message, schema_of
 from swarm.wire.route_columns import check_legs
 
@@ -51,7 +33,7 @@ class VehicleState(enum.IntEnum):
 
 NO_TARGET = 255
 """The highest of a byte: indices of targets are below it."""
-_Place = Annotated[bytes, Column("<f4", per="ids", least=-1e9, most=1e9)]
+_Place = Annotated[bytes, fields.Column("<f4", per="ids", least=-1e9, most=1e9)]
 
 
 class Fleet(Message, frozen=True, kw_only=True, tag=schema_of("fleet")):
@@ -63,20 +45,20 @@ class Fleet(Message, frozen=True, kw_only=True, tag=schema_of("fleet")):
     targets      index into target_ids, NO_TARGET (255) for none
     """
 
-    author: Id
-    group: Id
-    region: Region
-    seq: Natural
-    stamp_ns: StampNs
-    ids: Annotated[list[VehicleId], SMALL]
-    target_ids: Annotated[list[Id], Meta(max_length=NO_TARGET)]
-    cells: Annotated[bytes, Column("<u4", per="ids")]
+    author: fields.Id
+    group: fields.Id
+    region: fields.Region
+    seq: fields.Natural
+    stamp_ns: fields.StampNs
+    ids: Annotated[list[fields.VehicleId], fields.SMALL]
+    target_ids: Annotated[list[fields.Id], Meta(max_length=NO_TARGET)]
+    cells: Annotated[bytes, fields.Column("<u4", per="ids")]
     east_m: _Place
     south_m: _Place
-    heading_rad: Annotated[bytes, Column("<f4", per="ids", least=-2 * math.tau, most=2 * math.tau)]
-    states: Annotated[bytes, Column("<u1", per="ids", least=0, most=int(max(VehicleState)))]
-    targets: Annotated[bytes, Column("<u1", per="ids")]
-    vehicle_class: Id = "ground"
+    heading_rad: Annotated[bytes, fields.Column("<f4", per="ids", least=-2 * math.tau, most=2 * math.tau)]
+    states: Annotated[bytes, fields.Column("<u1", per="ids", least=0, most=int(max(VehicleState)))]
+    targets: Annotated[bytes, fields.Column("<u1", per="ids")]
+    vehicle_class: fields.Id = "ground"
 
     def relate(self) -> None:
         if any(t != NO_TARGET and t >= len(self.target_ids) for t in set(self.targets)):
@@ -91,13 +73,13 @@ class Chasers(Message, frozen=True, kw_only=True, tag=schema_of("chasers")):
     goals   the place of each vehicle, if these go to places
     """
 
-    target: Id | None
-    author: Id
-    stamp_ns: StampNs
-    ids: Annotated[list[VehicleId], SMALL]
-    cells: Annotated[bytes, Column("<u4", per="ids")]
-    vehicle_class: Id = "ground"
-    goals: Annotated[bytes, Meta(max_length=4 * MOST_VEHICLES), Column("<u4")] = b""
+    target: fields.Id | None
+    author: fields.Id
+    stamp_ns: fields.StampNs
+    ids: Annotated[list[fields.VehicleId], fields.SMALL]
+    cells: Annotated[bytes, fields.Column("<u4", per="ids")]
+    vehicle_class: fields.Id = "ground"
+    goals: Annotated[bytes, Meta(max_length=4 * fields.MOST_VEHICLES), fields.Column("<u4")] = b""
 
     def relate(self) -> None:
         expected = 0 if self.target is not None else len(self.cells)
@@ -117,15 +99,17 @@ class SharedCosts(Message, frozen=True, kw_only=True, tag=schema_of("shared-cost
     targets  the one that each vehicle chases, as an index into target_ids, NO_TARGET for none of these
     """
 
-    author: Id
-    group: Id
-    stamp_ns: StampNs
-    ids: Annotated[list[VehicleId], SMALL]
-    target_ids: Annotated[list[Id], Meta(max_length=MOST_SHARED_TARGETS)]
+    author: fields.Id
+    group: fields.Id
+    stamp_ns: fields.StampNs
+    ids: Annotated[list[fields.VehicleId], fields.SMALL]
+    target_ids: Annotated[list[fields.Id], Meta(max_length=MOST_SHARED_TARGETS)]
     costs_s: Annotated[
-        bytes, Meta(max_length=4 * MOST_VEHICLES * MOST_SHARED_TARGETS), Column("<f4", least=0, most=math.inf)
+        bytes,
+        Meta(max_length=4 * fields.MOST_VEHICLES * MOST_SHARED_TARGETS),
+        fields.Column("<f4", least=0, most=math.inf),
     ]
-    targets: Annotated[bytes, Column("<u1", per="ids")]
+    targets: Annotated[bytes, fields.Column("<u1", per="ids")]
 
     @property
     def agent(self) -> str:
@@ -135,7 +119,7 @@ class SharedCosts(Message, frozen=True, kw_only=True, tag=schema_of("shared-cost
     def relate(self) -> None:
         if not self.author.startswith(f"{self.group}.") or not self.agent:
             raise ValueError(f"author {self.author!r} is no agent of the group {self.group!r}")
-        check_column("costs_s", self.costs_s, 4, len(self.ids) * len(self.target_ids))
+        fields.check_column("costs_s", self.costs_s, 4, len(self.ids) * len(self.target_ids))
         prefix = f"{self.agent}-"
         strange = next((id for id in self.ids if not id.startswith(prefix)), None)
         if strange is not None:
@@ -153,13 +137,13 @@ class Followed(Message, frozen=True, kw_only=True, tag=schema_of("followed")):
     legs  of a pulled route, as in `Route`; the first begins where the vehicle is, on a segment perhaps
     """
 
-    vehicle: VehicleId
-    target: Id
-    start: Cell
-    directions: Directions
-    cost_s: FiniteCost
-    lower_bound_s: FiniteCost
-    legs: Legs = b""
+    vehicle: fields.VehicleId
+    target: fields.Id
+    start: fields.Cell
+    directions: fields.Directions
+    cost_s: fields.FiniteCost
+    lower_bound_s: fields.FiniteCost
+    legs: fields.Legs = b""
 
     def relate(self) -> None:
         check_legs([len(self.directions)], self.legs)
@@ -188,16 +172,16 @@ class Obstacle(Message, frozen=True, kw_only=True, tag=schema_of("body")):
     lease_s        the obstacle is forgotten this time after this message was heard; 0 takes it away at once
     """
 
-    id: VehicleId
-    group: Id = "all"
-    incarnation: Incarnation
-    seq: Natural
-    stamp_ns: StampNs = 0
-    x_m: Metres
-    y_m: Metres
+    id: fields.VehicleId
+    group: fields.Id = "all"
+    incarnation: fields.Incarnation
+    seq: fields.Natural
+    stamp_ns: fields.StampNs = 0
+    x_m: fields.Metres
+    y_m: fields.Metres
     heading_rad: Heading | None = None
     speed_m_per_s: Speed = 0.0
-    radius_m: Distance
+    radius_m: fields.Distance
     lease_s: Annotated[float, Meta(ge=0, le=LONGEST_OBSTACLE_LEASE_S)] = 1.0
 
 
@@ -205,7 +189,7 @@ class RemoveVehicles(Message, frozen=True, kw_only=True, tag=schema_of("remove-v
     """An operator asks an agent to let vehicles leave; all that it hosts if none is named. To ask again is
     harmless."""
 
-    vehicles: Annotated[list[VehicleId], SMALL] = []
+    vehicles: Annotated[list[fields.VehicleId], fields.SMALL] = []
 
 
 class Removed(Message, frozen=True, kw_only=True, tag=schema_of("removed")):
@@ -216,7 +200,7 @@ class Removed(Message, frozen=True, kw_only=True, tag=schema_of("removed")):
     held     of those that left: how many hold cells that are not known to be free yet
     """
 
-    agent: Id
-    left: Annotated[list[VehicleId], SMALL]
-    unknown: Annotated[list[VehicleId], SMALL] = []
-    held: Count = 0
+    agent: fields.Id
+    left: Annotated[list[fields.VehicleId], fields.SMALL]
+    unknown: Annotated[list[fields.VehicleId], fields.SMALL] = []
+    held: fields.Count = 0
