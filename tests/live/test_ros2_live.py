@@ -142,20 +142,6 @@ def test_a_peer_of_another_domain_or_distribution_is_named_in_the_log(
     older.close()
 
 
-def test_after_kill_9_of_the_gateway_nothing_of_it_is_left(gateway: Gateway, session: zenoh.Session) -> None:
-    there: set[str] = set()
-    node = PeerNode(session, "watcher", TYPES)
-    node.watch("0", lambda seen, is_there: there.add(seen.topic) if is_there else there.discard(seen.topic))
-    process = gateway.start()
-    try:
-        eventually(lambda: {topic_of(row) for row in OUT if row != "fix"} <= there, 40, "all topics")
-    finally:
-        process.kill()
-        process.wait(10)
-    eventually(lambda: not there, 15, "the end of all tokens")
-    node.close()
-
-
 def test_the_gateway_ends_at_ctrl_c_and_says_what_it_lacks(gateway: Gateway) -> None:
     process = gateway.start()
     eventually(lambda: "run " in gateway.said, 60, "the gateway's first word")

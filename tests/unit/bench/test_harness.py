@@ -6,7 +6,7 @@ from typing import Any
 import pytest
 import typer
 from bench import harness
-from bench.harness import BENCHMARKS, benchmark, load
+from bench.harness import benchmark
 from bench.isolated import isolated
 from support.benchmarks import bench, run
 
@@ -30,16 +30,6 @@ def made(monkeypatch: pytest.MonkeyPatch) -> None:
         """Nothing."""
         rows = list(harness.track(ROWS))
         return {"rows": rows, "share": 0.123456789, "wrong": wrong, "notes": ["A note."]}
-
-
-def test_each_benchmark_is_listed_and_teaches_with_an_example() -> None:
-    load()
-    listed = run().output
-    for name in BENCHMARKS:
-        assert name in listed
-        usage, _, taught = run(name, "--help").output.partition("[OPTIONS]")
-        assert name in usage
-        assert f"./launch_scripts/bench {name}" in taught
 
 
 def test_a_report_is_one_object_with_its_machine_or_tables_with_the_chosen_columns(made: None) -> None:

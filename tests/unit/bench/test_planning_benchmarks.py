@@ -141,24 +141,6 @@ def test_a_violation_is_counted_and_clips_no_figure() -> None:
     assert row["proven_p95"] == round(3.0 / 3.3, 5)
 
 
-def test_the_paper_s_tables_have_its_rows() -> None:
-    report = bench("paper", "--size", "48", "--frames", "6")
-    assert [(row["targets"], row["vehicles"]) for row in report["table_1"]] == [
-        (targets, vehicles) for targets in (1, 5, 10) for vehicles in (10, 50, 100)
-    ]
-    assert {row["strategy"]: row["printed_ms"] for row in report["table_2"]} == {
-        **dict.fromkeys(STRATEGIES),
-        "full": 892.6,
-        "variable_range": 319.4,
-        "variable_range+multi_resolution": 88.2,
-    }
-    assert "16 R10000 processors" in report["notes"][0]
-    assert "does not state all of its motion, its k_min and its block rule" in report["notes"][1]
-    exact = next(row for row in report["table_2"] if row["strategy"] == "full")
-    assert exact["gap_max"] < 1 + 1e-5
-    assert exact["updates"] == {"bounded": 60}
-
-
 # --- the map and its fleets --------------------------------------------------------------------------------------
 
 

@@ -14,12 +14,10 @@ from support.map_strategies import set_of
 from support.monitor_rig import Rig, hill, little_scenario, little_terrain
 
 from launch_scripts.monitor.ground_colours import (
-    FAST_MARK,
     FOUND,
     LETHAL_MARK,
     NO_GO,
     OVERRULED,
-    SLOW_MARK,
     STILL_HIDDEN_LETHAL,
     STILL_HIDDEN_SLOW,
     GroundColours,
@@ -38,10 +36,8 @@ from launch_scripts.monitor.live_layout import COST, PHOTO
 from launch_scripts.monitor.rerun_outputs import Pen, in_markdown, shown
 from launch_scripts.monitor.terrain_mesh import Bytes, Floats, TerrainMesh
 from launch_scripts.observe import fact_table as facts
-from launch_scripts.observe.palette import rgb
 from launch_scripts.observe.run_recorder import Recorder
 from launch_scripts.report.report_json import make_report, write_report
-from launch_scripts.report.run_picture import QUICKER, SLOWER, learned_pixels
 from shared_map.cost_map import CostMap
 from shared_map.learning.learned_factors import LearnedGauges
 from shared_map.learning.measurements import ONE, Measurement
@@ -76,17 +72,6 @@ def zoned(zones: str) -> Scenario:
 
 def near(pixel: Bytes, colour: tuple[int, ...], within: int = 45) -> bool:
     return bool((np.abs(pixel.astype(int) - np.array(colour)) <= within).all())
-
-
-def test_ground_that_was_known_to_be_lethal_looks_neither_like_open_ground_nor_like_a_mark() -> None:
-    closed = np.zeros((40, 50), np.bool_)
-    closed[10:30, 10:30] = True
-    changed = (colours_of(flat(closed)).photo_of(ALL) != colours_of(flat()).photo_of(ALL)).any(axis=2)
-    np.testing.assert_array_equal(changed, closed)
-    pixels = colours_of(flat(closed)).photo_of(ALL)[closed]
-    assert len(np.unique(pixels, axis=0)) >= 2, "hatched, not filled: to be told apart without colour"
-    marks = (LETHAL_MARK, SLOW_MARK, FAST_MARK)
-    assert not any(near(pixel, mark) for pixel in pixels[:40] for mark in marks)
 
 
 def test_a_zone_that_closes_ground_is_hatched_red_even_where_operators_ordered_it() -> None:
@@ -239,17 +224,6 @@ def test_things_stand_on_the_ground_between_cells_too() -> None:
     assert (placed[:, 2] / mesh.stretch).tolist() == pytest.approx([0, 5, 50, 100, 100], abs=1e-3)
 
 
-def test_gentle_land_is_stretched_and_a_void_is_level_with_the_lowest_ground() -> None:
-    terrain = hill(100, 100, top_m=5.0)
-    elevation_m = np.array(terrain.elevation_m) + 300
-    elevation_m[3, 3] = np.nan
-    mesh = TerrainMesh(terrain_of_pace(np.ones((100, 100), np.float32), 10.0, elevation_m))
-    assert mesh.stretch == 8.0
-    assert mesh.heights_m[3, 3] == 0.0
-    assert mesh.heights_m.max() == pytest.approx(40.0)
-    assert TerrainMesh(hill(100, 100, top_m=500.0)).stretch == 1.0
-
-
 def test_a_mark_changes_the_photo_of_the_tiles_that_show_its_cell_and_of_no_other() -> None:
     terrain = hill(130, 130)
     mesh = TerrainMesh(terrain)
@@ -317,15 +291,6 @@ def learned(**keys: float) -> tuple[CostMap, list[MarkSet]]:
     words = {FLAT: said(keys["flat"]), STEEP: said(keys["steep"])}
     sets = MapReplica(GROUND.grid, cost_map, author="all.a1.1").write_learned(words, 1)
     return cost_map, sets
-
-
-def test_the_picture_of_a_report_shows_factors_but_on_lethal_ground() -> None:
-    cost_map, _ = learned(flat=3.0, steep=0.4)
-    pixels = learned_pixels(GROUND, cost_map.factors)
-    assert tuple(pixels[30, 10, :3]) == rgb(SLOWER)
-    assert tuple(pixels[30, 40, :3]) == rgb(QUICKER)
-    assert pixels[30, 10, 3] > pixels[30, 40, 3] > 100
-    assert (pixels[:5, :5] == 0).all()
 
 
 def test_a_planner_tells_the_mean_factor_of_a_class_until_its_prior_stands_again() -> None:
