@@ -28,7 +28,7 @@ from swarm.bus.bus import Event, Heard
 from swarm.clock import NS_PER_S
 from swarm.config.scenario import MonitorConfig, Scenario
 from swarm.errors import BusError
-from swarm.liveness import Peer
+from swarm.peers import Peer
 from swarm.wire.fields import pack_column
 from swarm.wire.messages.orders import GoalState, GoalStates
 from swarm.wire.messages.planning import Believed, Sighted
