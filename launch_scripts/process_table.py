@@ -11,7 +11,7 @@ import msgspec
 from swarm.config.agent_plan import places_of, plan_agents
 from swarm.config.scenario import Scenario, ids_of
 from swarm.errors import ConfigError
-from swarm.liveness import ranked_id
+from swarm.peers import ranked_id
 from swarm.wire.fields import check_id
 
 

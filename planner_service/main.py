@@ -18,7 +18,7 @@ from shared_map.terrain.terrain import Terrain
 from shared_map.vehicle_class_grounds import load_classes
 from swarm.bus.bus import Bus
 from swarm.errors import ConfigError
-from swarm.liveness import job_of
+from swarm.peers import job_of
 from swarm.recording.role_process import run_role
 from swarm.recording.service_boundary import Boundary
 from swarm.runtime.inbox import Inbox

@@ -34,7 +34,7 @@ from swarm.config import agent_plan
 from swarm.config.scenario import PlannerConfig
 from swarm.config.vehicle_classes import GROUND
 from swarm.grid import Window
-from swarm.liveness import job_of
+from swarm.peers import job_of
 from swarm.runtime.inbox import FairQueue
 from swarm.wire.messages.orders import Obey
 from swarm.wire.messages.planning import PlaceRouteReply, PlaceRouteRequest, PlaceStatus, PushedRoute

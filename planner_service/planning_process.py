@@ -16,7 +16,7 @@ from swarm.bus.bus import Asked, Bus, Event, Post, Worker
 from swarm.config.agent_plan import agent_of
 from swarm.config.explain import choice
 from swarm.config.vehicle_classes import GROUND, class_numbers, first_classes
-from swarm.liveness import job_of
+from swarm.peers import job_of
 from swarm.runtime.election import Candidacy
 from swarm.runtime.membership import Member
 from swarm.runtime.order_client import OrderClient

@@ -23,7 +23,7 @@ from shared_map.sightings import Presence, Sightings, pose_of
 from swarm.bus.bus import Asked, Event, Heard, LinkChanged, WorkDone
 from swarm.clock import NS_PER_S
 from swarm.config.vehicle_classes import GROUND
-from swarm.liveness import job_of
+from swarm.peers import job_of
 from swarm.plugins.find import named_plugin
 from swarm.wire import topics
 from swarm.wire.messages.orders import Obey

@@ -17,7 +17,7 @@ import numpy as np
 from shared_map.array_files import Floats
 from shared_map.replication.interest import MarkFilter
 from swarm.clock import NS_PER_S
-from swarm.liveness import POSE_SILENCE_NS, Leases
+from swarm.peers import POSE_SILENCE_NS, Leases
 from swarm.wire.fields import LONGEST_LEASE_S
 from swarm.wire.messages.planning import Sighted, TargetPose
 from swarm.wire.messages.vehicles import Fleet
@@ -55,7 +55,7 @@ class Sightings:
     def receive(self, sighted: Sighted, now_ns: int) -> bool:
         """Takes in a sighting, even an expired one. False if it is no news, filtered out or beyond the limit.
 
-        An author's sighting with a lower number is news after a silence, as `swarm.liveness.Newest` has it.
+        An author's sighting with a lower number is news after a silence, as `swarm.peers.Newest` has it.
         """
         key = (sighted.target, sighted.author)
         known = self._newest.get(key)

@@ -13,7 +13,7 @@ from msgspec.structs import replace
 from swarm.bus.bus import Appeared, Asked, AskEnded, Bus, Disappeared, Event, Heard, Post, Replied
 from swarm.clock import NS_PER_S
 from swarm.config.agent_plan import plan_agents
-from swarm.liveness import Peer
+from swarm.peers import Peer
 from swarm.right_of_way.holdings import Tell, Wish
 from swarm.right_of_way.host import AskKnown
 from swarm.runtime.role_setup import RoleSetup

@@ -15,7 +15,7 @@ import typer
 from launch_scripts.commands import shared_options
 from launch_scripts.typer_commands import ADMIN, command, complete_scenarios
 from swarm.errors import ConfigError
-from swarm.liveness import ranked_id
+from swarm.peers import ranked_id
 
 if TYPE_CHECKING:
     from swarm.runtime.loop_health import Health

@@ -17,7 +17,7 @@ import typer
 from launch_scripts.typer_commands import CERTIFICATES, NETWORK, complete_runs, complete_scenarios, from_environment
 from swarm.config.input_files import FileKind, read_text
 from swarm.errors import BusError, ConfigError, SwarmError
-from swarm.liveness import HIGHEST_RANK
+from swarm.peers import HIGHEST_RANK
 
 if TYPE_CHECKING:
     from swarm.bus.zenoh_bus import ZenohBus

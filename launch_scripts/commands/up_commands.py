@@ -12,7 +12,7 @@ import typer
 
 from launch_scripts.commands import shared_options
 from launch_scripts.typer_commands import NETWORK, PART, RUN, command
-from swarm.liveness import HIGHEST_RANK
+from swarm.peers import HIGHEST_RANK
 
 app = typer.Typer()
 

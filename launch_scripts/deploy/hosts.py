@@ -16,7 +16,7 @@ from swarm.config.input_files import FileKind, parse_toml, read_text
 from swarm.config.load import check_endpoint, is_loopback
 from swarm.config.setting_types import Section
 from swarm.errors import ConfigError
-from swarm.liveness import HIGHEST_RANK
+from swarm.peers import HIGHEST_RANK
 
 HostName = Annotated[
     str,

@@ -20,7 +20,7 @@ from launch_scripts.deploy.machines_needed import one_process, swarm_of
 from swarm.config.agent_plan import plan_agents
 from swarm.config.scenario import Scenario, StandbyConfig
 from swarm.errors import ConfigError
-from swarm.liveness import job_of
+from swarm.peers import job_of
 
 ROUTER, KEEPER, AGENT = "router", "keeper", "agent"
 

@@ -11,7 +11,7 @@ from launch_scripts.launcher.local_processes import LocalSwarm
 from launch_scripts.process_table import ProcessSpec
 from swarm.config.scenario import Scenario
 from swarm.errors import SwarmError
-from swarm.liveness import job_of, ranked_id
+from swarm.peers import job_of, ranked_id
 from swarm.runtime.order_book import OrderBook
 
 log = logging.getLogger(__name__)

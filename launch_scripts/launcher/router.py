@@ -25,7 +25,7 @@ from swarm.clock import MonotonicClock
 from swarm.config.revocations import with_revocations
 from swarm.config.scenario import NetworkConfig
 from swarm.errors import BusError, SwarmError
-from swarm.liveness import Peer
+from swarm.peers import Peer
 from swarm.runtime.inbox import Inbox
 from swarm.runtime.membership import NO_RUN, Member
 from swarm.runtime.process import Process

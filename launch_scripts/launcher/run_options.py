@@ -29,7 +29,7 @@ from swarm.config.scenario import MonitorConfig, NetworkConfig, Scenario, TlsCon
 from swarm.errors import ConfigError, StoreError
 from swarm.files import make_folder, writing
 from swarm.journal import digest_of
-from swarm.liveness import split_rank
+from swarm.peers import split_rank
 
 SCENARIOS = Path(__file__).parents[1] / "scenarios"
 

@@ -18,7 +18,7 @@ from launch_scripts.launcher.local_processes import Running
 from launch_scripts.observe.run_registry import LAUNCHER_LOG, logging_into, open_logs
 from launch_scripts.process_table import ROLES, TABLE
 from swarm.errors import ConfigError
-from swarm.liveness import job_of
+from swarm.peers import job_of
 from swarm.runtime.loop_health import GENERATION_BEFORE
 
 log = logging.getLogger(__name__)

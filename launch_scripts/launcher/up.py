@@ -46,7 +46,7 @@ from swarm.bus.zenoh_bus import open_bus
 from swarm.clock import NS_PER_S, MonotonicClock
 from swarm.config.scenario import UNTIL_STOPPED_S
 from swarm.errors import BusError, StoreError, SwarmError
-from swarm.liveness import Peer, job_of
+from swarm.peers import Peer, job_of
 from swarm.plugins.find import check_plugins
 from swarm.runtime.membership import check_belongs
 from swarm.runtime.order_book import OrderBook

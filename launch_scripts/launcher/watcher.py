@@ -16,7 +16,7 @@ from swarm.bus.bus import Bus, Disappeared, Event, Heard
 from swarm.clock import Clock
 from swarm.errors import RunMismatchError
 from swarm.grid import GridSpec
-from swarm.liveness import Peer, job_of
+from swarm.peers import Peer, job_of
 from swarm.runtime.inbox import Inbox
 from swarm.runtime.stats import VIEWERS
 from swarm.wire.messages.planning import PlannerStatus

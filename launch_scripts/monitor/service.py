@@ -35,7 +35,7 @@ from swarm.bus.bus import Appeared, Bus, Disappeared, Event, Heard, Post, Replie
 from swarm.clock import NS_PER_S
 from swarm.config.ground import HiddenConfig
 from swarm.config.vehicle_classes import aloft_classes
-from swarm.liveness import Peer
+from swarm.peers import Peer
 from swarm.runtime.membership import Member
 from swarm.runtime.role_setup import RoleSetup
 from swarm.runtime.stats import VIEWERS, Counters

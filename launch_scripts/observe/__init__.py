@@ -9,7 +9,7 @@
 | latest_messages.py | `LatestState`: newest message of every sender; `RunPlan`: what the run should be         |
 | summed_counts.py   | `Counts`: sums of all processes, with the certified gap, and the load of each            |
 | run_state.py       | `RunState`: the run at an instant; `state_of` makes one                                  |
-| fact_table.py      | `FACTS`, `TARGET_FACTS`: name, label, unit, text and meaning of each fact                |
+| fact_table.py      | `FACTS`, `TARGET_FACTS`: name, label, unit and text of each fact                         |
 | run_alarms.py      | `Alarm`, `KINDS`: what went wrong, where, since when, and whether it is over             |
 | run_recorder.py    | `Recorder`: figures, tracks, routes, captures, notes over time, in bounded memory; it    |
 |                    | makes the numbers of the report, and results per target, group and vehicle               |

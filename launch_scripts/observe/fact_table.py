@@ -30,7 +30,6 @@ class Fact(Generic[Of]):
     name     in the report, and for programs
     label    what people call it
     text     its value in words; None where it is not known
-    meaning  what it says, in a sentence
     of       the field that holds it, where that has another name
     always   whether every table of targets has it; else `swarm status` alone
     """
@@ -38,7 +37,6 @@ class Fact(Generic[Of]):
     name: str
     label: str
     text: Callable[[Any], str]
-    meaning: str
     of: str = ""
     always: bool = True
 
@@ -103,68 +101,44 @@ def _word(value: str | None) -> str:
 
 
 FACTS: tuple[Fact[RunState], ...] = (
-    Fact("elapsed_s", "time", seconds, "Time since the run began, start-up included."),
-    Fact("vehicles_driven", "vehicles", of_all, "Vehicles that an agent drives, of all of the run.", of="driven"),
-    Fact("states", "of these", each, "States of the vehicles."),
-    Fact("classes", "classes", each, "The vehicles by class."),
-    Fact("following", "assigned", count, "Vehicles that have a target."),
-    Fact("sent", "sent to places", each, "Vehicles that were sent to places, by the state of their goals."),
-    Fact("external", "external vehicles", first_of, "External vehicles and other reported obstacles."),
-    Fact("captures", "captures", count, "How often targets were caught."),
-    Fact("marks", "marks", count, "Marks that vehicles made since the last start of their agents."),
-    Fact(
-        "reroute_requests", "re-route requests", count,
-        "How often a vehicle's own route did not lead it on, so that it asked for another.",
-    ),
-    Fact("routes_served", "routes served", count, "Routes that planners gave."),
-    Fact(
-        "certified_gap", "certified gap", _gap,
-        "How far above the optimum the routes that vehicles began can be at most, as planners have proven.",
-    ),
-    Fact(
-        "learned", "learned", factors,
-        "Learned factor on the prior pace of a kind of ground, from measurements of vehicles (map.learning).",
-    ),
-    Fact("collisions", "collisions", count, "Two vehicles on one cell; must be 0."),
-    Fact("lethal_entries", "lethal cells entered", count, "Vehicles on cells that are lethal in truth; must be 0."),
-    Fact(
-        "driven_into", "obstacles driven into", count,
-        "Vehicles that drove into an obstacle which had said in time where it is; must be 0.",
-    ),
-    Fact("hit_by_obstacles", "vehicles hit by obstacles", count, "The obstacles' own fault."),
-    Fact(
-        "processes_well", "needed processes", of_all,
-        "Processes that are alive, or ended as asked, of those that the run needs.", of="well",
-    ),
-    Fact("processes_ended", "of these ended as asked", count, "Needed processes that ended so.", of="ended"),
-    Fact("restarts", "restarts", count, "How often a process was started again."),
-    Fact(
-        "messages_now_per_s", "messages/s", count,
-        "Messages that all processes send per second, now.", of="messages_per_s",
-    ),
-    Fact(
-        "payloads_dropped", "payloads dropped", count,
-        "Messages that were no messages of this swarm, or came under a key that is not their sender's.",
-    ),
-)  # fmt: skip
-"""Facts on show of a run. A new row appears everywhere."""
+    Fact("elapsed_s", "time", seconds),
+    Fact("vehicles_driven", "vehicles", of_all, of="driven"),
+    Fact("states", "of these", each),
+    Fact("classes", "classes", each),
+    Fact("following", "assigned", count),
+    Fact("sent", "sent to places", each),
+    Fact("external", "external vehicles", first_of),
+    Fact("captures", "captures", count),
+    Fact("marks", "marks", count),
+    Fact("reroute_requests", "re-route requests", count),
+    Fact("routes_served", "routes served", count),
+    Fact("certified_gap", "certified gap", _gap),
+    Fact("learned", "learned", factors),
+    Fact("collisions", "collisions", count),
+    Fact("lethal_entries", "lethal cells entered", count),
+    Fact("driven_into", "obstacles driven into", count),
+    Fact("hit_by_obstacles", "vehicles hit by obstacles", count),
+    Fact("processes_well", "needed processes", of_all, of="well"),
+    Fact("processes_ended", "of these ended as asked", count, of="ended"),
+    Fact("restarts", "restarts", count),
+    Fact("messages_now_per_s", "messages/s", count, of="messages_per_s"),
+    Fact("payloads_dropped", "payloads dropped", count),
+)
+"""Facts on show of a run. A new row appears everywhere; the docstring of `RunState` says what each means."""
 
 TARGET_FACTS: tuple[Fact[TargetLine], ...] = (
-    Fact("target", "target", _word, "Its id, and exceptional states.", of="title"),
-    Fact("chased_by", "chased by", count, "Vehicles that go for it.", of="following"),
-    Fact("nearest_m", "nearest", distance, "Distance of the nearest vehicle."),
-    Fact("captures", "captures", count, "How often it was caught."),
-    Fact(
-        "certified_gap", "certified gap", lambda gap: NONE if gap is None else percent(gap.mean),
-        "How far above the optimum the routes to it can be at most, in the mean.", of="gap",
-    ),
-    Fact("re_plans", "re-plans", count, "How often its tree was grown or repaired.", of="growths"),
-    Fact("growth_ms", "tree", duration, "CPU time of the last full search."),
-    Fact("routes_served", "served", count, "Routes given to it.", always=False),
-    Fact("strategy", "strategy", _word, "How its tree is kept.", always=False),
-    Fact("pose_age_s", "seen", seconds, "Time since its last pose.", always=False),
-    Fact("tracker", "tracker", _word, "Tracker of the target.", always=False),
-)  # fmt: skip
+    Fact("target", "target", _word, of="title"),
+    Fact("chased_by", "chased by", count, of="following"),
+    Fact("nearest_m", "nearest", distance),
+    Fact("captures", "captures", count),
+    Fact("certified_gap", "certified gap", lambda gap: NONE if gap is None else percent(gap.mean), of="gap"),
+    Fact("re_plans", "re-plans", count, of="growths"),
+    Fact("growth_ms", "tree", duration),
+    Fact("routes_served", "served", count, always=False),
+    Fact("strategy", "strategy", _word, always=False),
+    Fact("pose_age_s", "seen", seconds, always=False),
+    Fact("tracker", "tracker", _word, always=False),
+)
 """Facts on show of each target, the most important first: a narrow panel cuts off the end."""
 
 _BY_NAME = {fact.name: fact for fact in FACTS}

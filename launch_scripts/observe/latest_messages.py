@@ -20,7 +20,7 @@ from swarm.clock import NS_PER_S
 from swarm.config.agent_plan import agent_of, crew_of
 from swarm.config.scenario import Scenario
 from swarm.grid import TILE_CELLS, GridSpec
-from swarm.liveness import FOR_GOOD_NS, HIGHEST_RANK, Newest, Peer, ranked_id, split_rank
+from swarm.peers import FOR_GOOD_NS, HIGHEST_RANK, Newest, Peer, ranked_id, split_rank
 from swarm.runtime.order_book import OrderBook
 from swarm.runtime.stats import ENDED
 from swarm.runtime.tracker_ownership import Trackings

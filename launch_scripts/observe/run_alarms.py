@@ -19,7 +19,7 @@ from launch_scripts.observe.latest_messages import LatestState
 from launch_scripts.plain_text import Duration, Moment, plain
 from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec
-from swarm.liveness import job_of
+from swarm.peers import job_of
 from swarm.wire.messages.processes import Alarm as WireAlarm
 from swarm.wire.topics import POSE, STATS, STATUS, Topic
 

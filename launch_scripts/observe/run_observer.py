@@ -22,7 +22,7 @@ from swarm.client.terrain_frame import Frame
 from swarm.clock import NS_PER_S, Clock
 from swarm.errors import BusError, ConfigError
 from swarm.grid import GridSpec
-from swarm.liveness import Peer
+from swarm.peers import Peer
 from swarm.runtime.inbox import Inbox
 from swarm.runtime.membership import NO_RUN
 from swarm.runtime.operator import replies_to

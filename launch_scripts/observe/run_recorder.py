@@ -29,7 +29,7 @@ from swarm.config.agent_plan import agent_of, plan_agents
 from swarm.config.scenario import Scenario
 from swarm.config.vehicle_classes import GROUND, flies
 from swarm.grid import GridSpec
-from swarm.liveness import Peer
+from swarm.peers import Peer
 from swarm.runtime.stats import CAPTURES_BY, CAPTURES_OF, GAPS_OF, UNPROVEN_OF, Histogram, merged
 from swarm.wire.messages import Message
 from swarm.wire.messages.planning import PlannerStatus

@@ -26,9 +26,15 @@ class TargetLine:
     planner_up  whether its planner or one of its standbys is as it should be
     starting    whether none of them has been seen yet, in the first seconds of a run
     rank        of the planner that leads; 0 unless a standby does
+    following   vehicles that go for it
     nearest_m   distance of the nearest vehicle
+    growths     how often its tree was grown or repaired
+    growth_ms   CPU time of the last full search
+    captures    how often it was caught
+    gap         how far above the optimum the routes to it can be at most
     pose_age_s  time since its last pose; None before the first
     lost        whether no tracker publishes it: the position is the last known one
+    strategy    how its tree is kept
     """
 
     id: str
@@ -64,19 +70,31 @@ class TargetLine:
 class RunState:
     """A run at an instant. `fact_table.FACTS` selects and formats its fields.
 
-    elapsed_s       time of the run, since it began
-    states          vehicles that are driven, by VehicleState
-    classes         the same by class, "ground" first
-    driven          vehicles that an agent drives, and all of the run
-    well            processes that are as they should be (alive, or ended because they were asked to), and all that
-                    the run needs
-    ended           of these, processes that ended because they were asked to
-    external        ids of external vehicles and other obstacles which report their places now
-    crew            the same by role
-    learned         class of ground -> measured factor on its prior pace; only classes whose factor is not 1
-    goals           progress of the vehicles that were sent to places
-    beside          processes that are alive and not needed: routers, monitors, agents of external vehicles
-    messages_per_s  that all processes send now
+    elapsed_s         time since the run began, start-up included
+    states            vehicles that are driven, by VehicleState
+    classes           the same by class, "ground" first
+    driven            vehicles that an agent drives, and all of the run
+    following         vehicles that have a target
+    captures          how often targets were caught
+    collisions        two vehicles on one cell; must be 0
+    lethal_entries    vehicles on cells that are lethal in truth; must be 0
+    driven_into       vehicles that drove into an obstacle which had said in time where it is; must be 0
+    hit_by_obstacles  the obstacles' own fault
+    reroute_requests  how often a vehicle's own route did not lead it on, so that it asked for another
+    routes_served     routes that planners gave
+    marks             marks that vehicles made since the last start of their agents
+    messages_per_s    messages that all processes send now
+    payloads_dropped  messages that were none of this swarm, or came under a key that is not their sender's
+    well              processes that are as they should be (alive, or ended because they were asked to), and all
+                      that the run needs
+    ended             of these, processes that ended because they were asked to
+    external          ids of external vehicles and other obstacles which report their places now
+    restarts          how often a process was started again
+    crew              as `well`, by role
+    beside            processes that are alive and not needed: routers, monitors, agents of external vehicles
+    certified_gap     how far above the optimum the routes that vehicles began can be at most, as proven
+    learned           class of ground -> measured factor on its prior pace; only classes whose factor is not 1
+    goals             progress of the vehicles that were sent to places
     """
 
     elapsed_s: float

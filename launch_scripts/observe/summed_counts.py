@@ -13,7 +13,7 @@ from dataclasses import dataclass
 from typing import TypeVar
 
 from swarm.clock import NS_PER_S
-from swarm.liveness import job_of
+from swarm.peers import job_of
 from swarm.runtime import stats as counters
 from swarm.runtime.stats import Histogram, merged
 from swarm.wire.messages.processes import Stats

@@ -25,8 +25,10 @@ from numpy.typing import NDArray
 
 from launch_scripts.observe import palette
 from launch_scripts.observe.fact_table import count, duration, fact
+from launch_scripts.observe.run_state import RunState
 from launch_scripts.observe.summed_counts import percent
 from launch_scripts.plain_text import number_of
+from swarm.config.explain import meanings
 from swarm.errors import StoreError
 from swarm.files import replacing
 
@@ -230,6 +232,7 @@ class Card(NamedTuple):
 
 def cards(report: Mapping[str, Any]) -> list[Card]:
     """The main figures of a run, for the picture and the page."""
+    said = meanings(RunState)
     gap = report["certified_gap"]
     unproven = gap.get("unproven") or 0
     not_counted = f" {count(unproven)} had none and are not counted." if unproven else ""
@@ -245,8 +248,10 @@ def cards(report: Mapping[str, Any]) -> list[Card]:
     )
 
     def of_facts(*names: str, tone: Callable[[Any], str] = lambda value: "") -> list[Card]:
-        told = [(fact(name), report[name]) for name in names]
-        return [Card(each.label, each.text(value), each.meaning, tone(value)) for each, value in told]
+        told = [(fact(name), report[name], said[name]) for name in names]
+        return [
+            Card(of.label, of.text(value), f"{text[0].upper()}{text[1:]}.", tone(value)) for of, value, text in told
+        ]
 
     return [
         *of_facts("captures", "marks", "reroute_requests", "routes_served"),

@@ -20,7 +20,7 @@ from swarm.config.agent_plan import agent_of, plan_agents
 from swarm.config.scenario import Scenario
 from swarm.config.vehicle_classes import GROUND
 from swarm.errors import ConfigError, StoreError
-from swarm.liveness import Peer
+from swarm.peers import Peer
 from swarm.places import cell_of
 from swarm.runtime import order_book
 from swarm.runtime.membership import Member

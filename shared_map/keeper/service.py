@@ -24,7 +24,7 @@ from swarm.bus.bus import Appeared, Asked, Bus, Disappeared, Event, Heard, Post
 from swarm.clock import NS_PER_S
 from swarm.config.vehicle_classes import class_numbers
 from swarm.errors import StoreError
-from swarm.liveness import Roster
+from swarm.peers import Roster
 from swarm.runtime.membership import Member
 from swarm.runtime.role_setup import RoleSetup
 from swarm.runtime.stats import figures

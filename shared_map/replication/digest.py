@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarm.clock import NS_PER_S
-from swarm.liveness import Newest
+from swarm.peers import Newest
 from swarm.wire.messages.map_data import DIGEST_ROW, DIGEST_ROW_BYTES, Digest
 
 _FEW = 64

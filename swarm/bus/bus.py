@@ -30,7 +30,7 @@ from dataclasses import dataclass, field
 from typing import Protocol, TypeVar
 
 from swarm.errors import ProtocolError
-from swarm.liveness import Peer
+from swarm.peers import Peer
 from swarm.wire.meant_key import MisroutedError
 from swarm.wire.messages import Message
 from swarm.wire.topics import NO_ASKER, Topic

@@ -34,7 +34,7 @@ from swarm.bus.bus import (
 from swarm.bus.scheduler import Scheduler
 from swarm.clock import NS_PER_S
 from swarm.errors import ProtocolError
-from swarm.liveness import Peer
+from swarm.peers import Peer
 from swarm.wire.access import Authenticator, check_code, code_of
 from swarm.wire.codec import decode, decode_either, encode
 from swarm.wire.meant_key import check_meant, meant_for

@@ -45,7 +45,7 @@ from swarm.bus.endpoints import keeps_open, wait_for_router, why_not_listening, 
 from swarm.bus.zenoh_config import patterned, session_config
 from swarm.config.scenario import NetworkConfig
 from swarm.errors import BusError, ProtocolError
-from swarm.liveness import Peer
+from swarm.peers import Peer
 from swarm.wire.access import Authenticator, code_of
 from swarm.wire.codec import decode_either, encode, encode_json
 from swarm.wire.meant_key import check_meant, meant_for

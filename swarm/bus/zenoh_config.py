@@ -17,7 +17,7 @@ import zenoh
 from swarm.config.scenario import NetworkConfig, TlsConfig
 from swarm.config.setting_types import RESERVED_GROUPS
 from swarm.errors import ConfigError
-from swarm.liveness import job_of
+from swarm.peers import job_of
 from swarm.wire.access import CODE_BYTES, MEMBERS, ROLES, Grant
 from swarm.wire.codec import MAX_PAYLOAD_BYTES
 from swarm.wire.fields import check_id

@@ -8,7 +8,7 @@ import msgspec
 
 from swarm.config.scenario import GroupConfig, Scenario
 from swarm.errors import ConfigError
-from swarm.liveness import ranked_id
+from swarm.peers import ranked_id
 
 
 class AgentPlan(msgspec.Struct, frozen=True):

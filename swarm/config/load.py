@@ -22,7 +22,7 @@ from swarm.config.scenario import Scenario, TlsConfig, ids_of
 from swarm.config.setting_types import MOST_TARGETS, RESERVED_GROUPS
 from swarm.config.vehicle_classes import aloft_classes, class_faults, complete_costs
 from swarm.errors import ConfigError
-from swarm.liveness import split_rank
+from swarm.peers import split_rank
 from swarm.places import read_place
 
 log = logging.getLogger(__name__)

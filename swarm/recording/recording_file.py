@@ -27,7 +27,7 @@ from swarm.bus import bus
 from swarm.config.agent_plan import AddedAgent
 from swarm.config.input_files import FileKind, check_bytes
 from swarm.errors import ProtocolError, StoreError
-from swarm.liveness import Peer
+from swarm.peers import Peer
 from swarm.recording.service_boundary import content_of
 from swarm.runtime.stats import Counters, Histogram
 from swarm.wire.codec import decode, decode_either, decode_many

@@ -17,7 +17,7 @@ import numpy as np
 
 from swarm.bus.bus import Answerer, Asked, Bus, Heard, Post, Worker
 from swarm.errors import StoreError
-from swarm.liveness import Peer
+from swarm.peers import Peer
 from swarm.runtime.process import Service
 from swarm.wire.codec import decode
 from swarm.wire.messages import Message

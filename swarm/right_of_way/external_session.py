@@ -18,7 +18,7 @@ from swarm.bus.bus import Appeared, AskEnded, Bus, Disappeared, Event, Heard, Po
 from swarm.clock import NS_PER_S, MonotonicClock
 from swarm.errors import BusError, ConfigError
 from swarm.grid import GridSpec
-from swarm.liveness import Peer
+from swarm.peers import Peer
 from swarm.right_of_way.external_vehicle import Answers, ExternalVehicle, Removal, SaveGenerations
 from swarm.right_of_way.generations import MemoryGenerations
 from swarm.right_of_way.holdings import Tell

@@ -6,7 +6,7 @@ from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass
 
 from swarm.clock import NS_PER_S
-from swarm.liveness import Peer, Roster
+from swarm.peers import Peer, Roster
 from swarm.right_of_way.generations import first_generation, is_far_ahead
 from swarm.right_of_way.holdings import Holdings
 from swarm.right_of_way.shards import Shards

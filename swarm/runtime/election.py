@@ -12,7 +12,7 @@ from dataclasses import dataclass
 
 from swarm.bus.bus import Bus, Event, Heard, Post
 from swarm.clock import NS_PER_S
-from swarm.liveness import FOR_GOOD_NS, Newest, job_of, ranked_id, split_rank
+from swarm.peers import FOR_GOOD_NS, Newest, job_of, ranked_id, split_rank
 from swarm.runtime.membership import Member
 from swarm.runtime.role_setup import RoleSetup
 from swarm.wire.messages.processes import Heartbeat

@@ -11,7 +11,7 @@ import msgspec
 from swarm.bus.bus import Appeared, Asked, AskEnded, Bus, Disappeared, Event, LinkChanged, Post, Replied
 from swarm.clock import NS_PER_S
 from swarm.errors import RunMismatchError
-from swarm.liveness import Peer
+from swarm.peers import Peer
 from swarm.runtime.stats import MESSAGES_PER_S, READY, RESTARTS, Counters, carried
 from swarm.wire.fields import MOST_TEXT
 from swarm.wire.messages import Message, Nothing

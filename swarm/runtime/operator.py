@@ -19,7 +19,7 @@ from msgspec.structs import replace
 from swarm.bus.bus import Appeared, AskEnded, Bus, Disappeared, Event, Replied
 from swarm.config.agent_plan import agent_of
 from swarm.errors import BusError, ConfigError
-from swarm.liveness import Roster, job_of
+from swarm.peers import Roster, job_of
 from swarm.runtime.inbox import Inbox
 from swarm.wire.messages import Message, Nothing
 from swarm.wire.messages.map_data import DIGEST_ROW_BYTES

@@ -28,7 +28,7 @@ import msgspec
 
 from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec
-from swarm.liveness import POSE_SILENCE_NS
+from swarm.peers import POSE_SILENCE_NS
 from swarm.wire.messages.planning import CELL_OF_PLACE, TargetPose
 
 SAME_NS = 3 * NS_PER_S // 4
@@ -197,7 +197,7 @@ class Trackings:
 
 
 def _is_late(seq: int, generation: _Generation, now_ns: int) -> bool:
-    """Same rule as in `swarm.liveness.Newest`: after a silence any other number counts as new, so that no pose
+    """Same rule as in `swarm.peers.Newest`: after a silence any other number counts as new, so that no pose
     outweighs all later ones."""
     return seq == generation.seq or (seq < generation.seq and now_ns - generation.heard_ns < POSE_SILENCE_NS)
 

@@ -12,7 +12,7 @@ from dataclasses import dataclass, field, replace
 from enum import Enum
 
 from swarm.errors import ProtocolError
-from swarm.liveness import Peer
+from swarm.peers import Peer
 from swarm.wire.access import MEMBERS, MEMBERS_OWN, Access, Act, access
 from swarm.wire.codec import prime
 from swarm.wire.messages import Message, Nothing, map_data, orders, planning, processes, traffic, vehicles

@@ -9,7 +9,7 @@ from dataclasses import dataclass, field
 import pytest
 
 from swarm.clock import NS_PER_S
-from swarm.liveness import job_of, ranked_id, split_rank
+from swarm.peers import job_of, ranked_id, split_rank
 from swarm.runtime.election import HEARTBEAT_NS, LEASE_NS, SETTLED_NS, Leadership
 from swarm.wire.messages.processes import Heartbeat
 

@@ -36,7 +36,7 @@ from swarm.config.agent_plan import plan_agents
 from swarm.config.load import parse_scenario
 from swarm.config.scenario import Scenario
 from swarm.errors import ProtocolError
-from swarm.liveness import Peer
+from swarm.peers import Peer
 from swarm.wire.access import Act, Authenticator
 from swarm.wire.codec import decode
 from swarm.wire.fields import OR_INFINITE, Column, taken_apart

@@ -14,7 +14,7 @@ from support.message_fuzzer import NAMES, MessageFuzzer
 
 from swarm.bus.bus import Bus, Post
 from swarm.errors import ProtocolError
-from swarm.liveness import Peer
+from swarm.peers import Peer
 from swarm.wire.codec import encode
 from swarm.wire.route_columns import RouteStatus
 from swarm.wire.topics import TOPICS, Topic, check_size

@@ -28,7 +28,7 @@ from support.live_swarm import SMALL_WORLD
 from support.machines import Machines, machines, why_not
 from support.processes import eventually
 
-from swarm.liveness import job_of, split_rank
+from swarm.peers import job_of, split_rank
 
 pytestmark = [pytest.mark.network, pytest.mark.slow]
 

@@ -35,7 +35,7 @@ from swarm.bus.zenoh_bus import ZenohBus, open_bus
 from swarm.clock import MonotonicClock
 from swarm.config.scenario import NetworkConfig
 from swarm.errors import BusError
-from swarm.liveness import Peer
+from swarm.peers import Peer
 from swarm.runtime.inbox import Inbox
 from swarm.runtime.operator import Operator
 from swarm.runtime.process import Process

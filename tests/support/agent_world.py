@@ -20,7 +20,7 @@ from swarm.clock import NS_PER_S
 from swarm.config.agent_plan import AgentPlan, plan_agents
 from swarm.config.load import parse_scenario
 from swarm.grid import walk
-from swarm.liveness import Peer
+from swarm.peers import Peer
 from swarm.wire.fields import column
 from swarm.wire.messages.map_data import MarkKind, MarkSet
 from swarm.wire.messages.planning import CostReply, CostRequest, RouteReply, RouteRequest, TargetPose

@@ -9,7 +9,7 @@ from support.makers import run_info
 
 from shared_map.replication.marks import packed
 from swarm.bus.bus import Appeared, AskEnded, Disappeared, Heard, HeardMany, LinkChanged, Replied
-from swarm.liveness import Peer
+from swarm.peers import Peer
 from swarm.wire.codec import encode
 from swarm.wire.meant_key import meant_for
 from swarm.wire.messages import Nothing

@@ -15,7 +15,7 @@ from shared_map.array_files import Floats
 from shared_map.terrain.terrain import Terrain
 from swarm.config.load import parse_scenario
 from swarm.config.scenario import Scenario
-from swarm.liveness import Peer
+from swarm.peers import Peer
 from swarm.wire.messages import Message
 
 

@@ -26,7 +26,7 @@ from swarm.config.agent_plan import agent_of
 from swarm.config.vehicle_classes import GROUND, MOST_CLASSES
 from swarm.errors import OutsideGridError, ProtocolError
 from swarm.grid import GridSpec
-from swarm.liveness import Peer
+from swarm.peers import Peer
 from swarm.wire.codec import decode, encode
 from swarm.wire.fields import OR_INFINITE, Bounded, Characters, Column, pack_column, taken_apart
 from swarm.wire.messages import Message

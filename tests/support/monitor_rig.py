@@ -19,7 +19,7 @@ from launch_scripts.web.http_server import Audience
 from shared_map.terrain.terrain import Terrain, terrain_of_pace
 from swarm.bus.memory_bus import MemoryBus
 from swarm.config.scenario import MonitorConfig, Scenario
-from swarm.liveness import Peer
+from swarm.peers import Peer
 from swarm.wire import topics
 from swarm.wire.messages import Message
 from swarm.wire.messages.map_data import MarkSet

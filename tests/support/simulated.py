@@ -22,7 +22,7 @@ from swarm.clock import NS_PER_S
 from swarm.config.agent_plan import AddedAgent, agent_of, plan_agents
 from swarm.config.load import parse_scenario
 from swarm.config.scenario import Scenario
-from swarm.liveness import ranked_id
+from swarm.peers import ranked_id
 from swarm.right_of_way.external_session import ExternalService
 from swarm.right_of_way.generations import MemoryGenerations
 from swarm.runtime.order_book import OrderBook

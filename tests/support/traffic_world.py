@@ -12,7 +12,7 @@ from functools import cache
 from swarm.clock import NS_PER_S
 from swarm.config.agent_plan import agent_of
 from swarm.grid import GridSpec
-from swarm.liveness import Peer
+from swarm.peers import Peer
 from swarm.right_of_way.holdings import Tell, Wish
 from swarm.right_of_way.host import AskKnown
 from swarm.right_of_way.shards import Shards

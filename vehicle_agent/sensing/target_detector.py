@@ -10,7 +10,7 @@ from shared_map.replication.interest import MarkFilter
 from shared_map.sightings import Sightings, pose_of
 from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec
-from swarm.liveness import POSE_SILENCE_NS, Newest
+from swarm.peers import POSE_SILENCE_NS, Newest
 from swarm.runtime.tracker_ownership import Trackings
 from swarm.wire.messages.planning import Sighted, TargetPose
 from vehicle_agent.driving.driven_vehicle import Places

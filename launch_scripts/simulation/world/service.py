@@ -13,7 +13,7 @@ from shared_map.terrain.store import load_homes
 from shared_map.terrain.terrain import Terrain
 from swarm.bus.bus import Appeared, Bus, Disappeared, Event, Heard, Post, Replied
 from swarm.clock import NS_PER_S
-from swarm.liveness import HIGHEST_RANK, Roster, job_of, ranked_id
+from swarm.peers import HIGHEST_RANK, Roster, job_of, ranked_id
 from swarm.runtime.election import Candidacy
 from swarm.runtime.membership import Member
 from swarm.runtime.order_client import OrderClient

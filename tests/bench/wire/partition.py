@@ -42,7 +42,7 @@ from swarm.bus.zenoh_bus import open_bus
 from swarm.clock import MonotonicClock
 from swarm.config.scenario import NetworkConfig, Scenario, TlsConfig
 from swarm.errors import SwarmError
-from swarm.liveness import Peer
+from swarm.peers import Peer
 from swarm.runtime.inbox import Inbox
 from swarm.runtime.membership import Member
 from swarm.runtime.process import Process

@@ -14,7 +14,7 @@ from launch_scripts.observe.summed_counts import Counts
 from swarm.clock import NS_PER_S
 from swarm.config.scenario import GroupConfig, Scenario, TargetConfig
 from swarm.grid import GridSpec
-from swarm.liveness import Peer
+from swarm.peers import Peer
 from swarm.wire.messages.processes import Stats
 
 

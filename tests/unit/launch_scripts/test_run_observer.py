@@ -14,7 +14,7 @@ from launch_scripts.observe.run_observer import OutsideObserver, RunObserver
 from swarm.bus.bus import Appeared, AskEnded, Disappeared, Heard, Replied
 from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec
-from swarm.liveness import Peer
+from swarm.peers import Peer
 from swarm.wire.messages.orders import GoalState, GoalStates
 from swarm.wire.messages.processes import Stats
 from swarm.wire.topics import FLEET, RUN, STATS

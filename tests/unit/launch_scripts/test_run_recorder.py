@@ -21,7 +21,7 @@ from swarm.clock import NS_PER_S
 from swarm.config.load import parse_scenario
 from swarm.config.scenario import Scenario, StandbyConfig
 from swarm.grid import GridSpec
-from swarm.liveness import Peer
+from swarm.peers import Peer
 from swarm.runtime.stats import CAPTURES_OF, GAPS_TO, Counters
 from swarm.wire.codec import decode, encode
 from swarm.wire.fields import ZERO_BUCKET

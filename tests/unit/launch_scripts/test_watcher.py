@@ -20,7 +20,7 @@ from launch_scripts.process_table import ProcessSpec, processes_of
 from swarm.bus.bus import Appeared, Disappeared
 from swarm.clock import NS_PER_S
 from swarm.config.load import parse_scenario
-from swarm.liveness import Peer, split_rank
+from swarm.peers import Peer, split_rank
 from swarm.runtime.stats import VIEWERS
 from swarm.wire.messages.orders import Order, Orders
 from swarm.wire.messages.processes import Alarm, Note, Stats

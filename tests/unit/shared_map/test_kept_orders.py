@@ -15,7 +15,7 @@ from shared_map.terrain.terrain import terrain_of_pace
 from swarm.bus.bus import Event
 from swarm.config.load import parse_scenario
 from swarm.grid import GridSpec
-from swarm.liveness import Peer
+from swarm.peers import Peer
 from swarm.wire.codec import decode, encode
 from swarm.wire.messages.orders import GiveOrder, Goals, GoalState, GoalStates, Order, Orders, SendVehicle
 from swarm.wire.topics import GIVE_ORDER, GOAL_STATES, GOALS, SEND_VEHICLE

@@ -11,7 +11,7 @@ from shared_map.replication.interest import MarkFilter
 from shared_map.sightings import LONGEST_NS, Sightings, pose_of
 from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec
-from swarm.liveness import POSE_SILENCE_NS
+from swarm.peers import POSE_SILENCE_NS
 from swarm.wire.messages.planning import Sighted, TargetPose
 from swarm.wire.topics import SIGHTED
 from vehicle_agent.driving.driven_vehicle import Places, Vehicle

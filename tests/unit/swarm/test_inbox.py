@@ -24,7 +24,7 @@ from swarm.bus.bus import (
     Undecoded,
     WorkDone,
 )
-from swarm.liveness import Peer
+from swarm.peers import Peer
 from swarm.runtime.inbox import CAPACITY, PER_ASKER_BYTES, FairQueue, Inbox
 from swarm.wire.messages import Nothing
 from swarm.wire.messages.planning import TargetPose

@@ -8,7 +8,7 @@ from support.swarm_model import SwarmModel
 from swarm.bus.bus import Event, LinkChanged
 from swarm.errors import RunMismatchError
 from swarm.grid import GridSpec
-from swarm.liveness import Peer
+from swarm.peers import Peer
 from swarm.runtime.membership import NO_RUN, Member, check_same_run
 from swarm.wire.topics import NOTE, RUN, STATS
 

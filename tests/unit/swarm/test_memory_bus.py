@@ -14,7 +14,7 @@ from swarm.bus import memory_bus
 from swarm.bus.bus import AskEnded, Disappeared, Replied, WorkDone
 from swarm.bus.scheduler import InlineWorker, Scheduler
 from swarm.clock import ManualClock
-from swarm.liveness import Peer
+from swarm.peers import Peer
 from swarm.wire.codec import decode
 from swarm.wire.messages import Nothing, schema_of
 from swarm.wire.topics import NOTE, POSE, RUN

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from swarm.errors import ProtocolError
-from swarm.liveness import Peer
+from swarm.peers import Peer
 from swarm.wire.topics import FLEET, KNOWN, MARKS, POSE, TOPICS, peer_of
 
 chunks = st.text("abzAZ09_.-", min_size=1, max_size=12)

@@ -5,7 +5,7 @@ import random
 from hypothesis import given
 from hypothesis import strategies as st
 
-from swarm.liveness import SILENCE_NS, Leases, Newest, Peer, Roster
+from swarm.peers import SILENCE_NS, Leases, Newest, Peer, Roster
 
 
 def test_a_new_incarnation_may_appear_before_the_old_one_is_gone():
