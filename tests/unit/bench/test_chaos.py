@@ -105,9 +105,3 @@ def test_growth_is_held_against_long_runs_only() -> None:
     assert results(3600.0, samples=samples(3600, 0.02)).broken() == []
     assert results(100.0, samples=samples(100, 0.5)).broken() == []
     assert results().growth() == {"rss_mb of launcher": None, "threads": None, "files": None}
-
-
-def test_a_minute_shows_the_memory_of_each_role_and_the_faults_until_then() -> None:
-    first, second = results(120.0, samples=samples(120, 0.0), outcomes=[outcome(CALM), outcome()]).minutes()
-    assert (first["minute"], first["launcher_mb"], first["agent_mb"], first["faults"]) == (0, 100.0, 50.0, 1)
-    assert second["minute"] == 1

@@ -1,19 +1,15 @@
 """Benchmarks of planning run small, and their figures keep what must hold."""
 
 from dataclasses import replace
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 from bench.planning import peers as rivals
-from bench.planning.chase import BROKEN, Plan, Tally, chase
+from bench.planning.chase import BROKEN, Tally
 from support.benchmarks import bench
-from support.fields import FIELDS, Field, make_field
+from support.fields import FIELDS
 from support.tree_lives import LAWS
 
-from swarm.config.scenario import PlannerConfig
-from swarm.errors import TerrainError
 from swarm.wire.route_columns import Route, RouteBatch, RouteStatus
 
 STRATEGIES = ("auto", "exact", "full", "variable_range", "multi_resolution", "variable_range+multi_resolution")
@@ -34,12 +30,6 @@ def test_peers_agree_with_ours_and_every_ratio_is_that_of_the_times(field: str) 
         assert rows[name]["differs_from_ours"] < (1e-3 if name.startswith("tcod") else 1e-5), name
 
 
-def test_costs_along_parents_are_sums_and_circles_cost_inf() -> None:
-    pace = np.array([[1, 2, 4, 8, 16]], np.float32)
-    parents = np.array([-1, 0, 1, 4, 3])
-    np.testing.assert_array_equal(rivals.costs_along(pace, parents, 0), [[0, 1, 3, np.inf, np.inf]])
-
-
 @pytest.mark.parametrize("field", FIELDS)
 def test_searches_for_one_path_cost_what_our_tree_says(field: str) -> None:
     report = bench("pursuit", "--size", "64", "--moves", "60", "--field", field)
@@ -57,39 +47,6 @@ def test_places_grow_as_far_as_their_askers() -> None:
 
 
 # --- fields ------------------------------------------------------------------------------------------------------
-
-
-def test_a_field_may_be_an_array_a_map_or_a_terrain(tmp_path: Path) -> None:
-    pace = np.array([[1, 2, np.inf], [3, 4, 5]], np.float64)
-    np.save(tmp_path / "pace.npy", pace)
-    made = make_field(str(tmp_path / "pace.npy"), 9)
-    np.testing.assert_array_equal(made, pace.astype(np.float32))
-    assert made.flags.writeable, "kernels take no array that may only be read"
-    (tmp_path / "a.map").write_text("type octile\nheight 2\nwidth 3\nmap\n..@\nT.G\n", encoding="ascii")
-    np.testing.assert_array_equal(
-        make_field(str(tmp_path / "a.map"), 9), np.array([[1, 1, np.inf], [np.inf, 1, 1]], np.float32)
-    )
-    rows = "\n".join(" ".join(str(row + col) for col in range(12)) for row in range(10))
-    (tmp_path / "a.asc").write_text(
-        f"ncols 12\nnrows 10\nxllcorner 0\nyllcorner 0\ncellsize 30\nNODATA_value -9999\n{rows}\n", encoding="ascii"
-    )
-    assert make_field(str(tmp_path / "a.asc"), 9).shape == (10, 12)
-
-
-@pytest.mark.parametrize(
-    ("array", "complaint"),
-    [
-        (np.array([[1.0, -2.0]]), "row 0, column 1: a pace of -2.0; expected more than 0"),
-        (np.array([[np.nan]]), "row 0, column 0: a pace of nan"),
-        (np.ones(3), r"shape \(3,\) of float64; expected rows x cols"),
-        (np.array([["a"]]), r"shape \(1, 1\) of <U1; expected rows x cols"),
-        (np.full((3, 3), np.inf), "every cell of the terrain is lethal"),
-    ],
-)
-def test_an_array_that_is_no_field_is_refused(tmp_path: Path, array: Any, complaint: str) -> None:
-    np.save(tmp_path / "a.npy", array)
-    with pytest.raises(TerrainError, match=complaint):
-        Field(make_field(str(tmp_path / "a.npy"), 9))
 
 
 # --- chases ------------------------------------------------------------------------------------------------------
@@ -118,17 +75,6 @@ def test_certificates_are_checked_by_a_command() -> None:
     assert report["checks"] >= 2000
     assert report["violations"] == 0
     assert [row["law"] for row in report["laws"]] == list(LAWS)
-
-
-def test_all_strategies_see_the_same_moves_and_a_seed_repeats_them() -> None:
-    field = Field(make_field("terrain", 64))
-    plan = Plan(targets=2, vehicles=6, frames=12, seed=5)
-    one = chase(field, {"multi_resolution": PlannerConfig(strategy="multi_resolution")}, plan)
-    two = chase(
-        field, {name: PlannerConfig(strategy=name) for name in ("full", "variable_range", "multi_resolution")}, plan
-    )
-    for a, b in zip(one["multi_resolution"].gaps, two["multi_resolution"].gaps, strict=True):
-        np.testing.assert_array_equal(a, b)
 
 
 def test_a_violation_is_counted_and_clips_no_figure() -> None:

@@ -1,12 +1,10 @@
 """`bench swarm` and `bench crowd`: sizes, figures from counters, tables."""
 
-import json
 import math
-from typing import Any
 
 import msgspec
 import pytest
-from bench.whole_swarm import crowd, sizes
+from bench.whole_swarm import crowd
 from bench.whole_swarm.size import CELLS_PER_VEHICLE, scenario_of, size_of
 from bench.whole_swarm.stats_window import StatsWindow, ticks
 from hypothesis import given
@@ -17,7 +15,6 @@ from support.makers import fleet_of
 
 from launch_scripts.launcher.run_options import find_scenario
 from swarm.config.agent_plan import plan_agents
-from swarm.errors import SwarmError
 from swarm.runtime.stats import Counters
 from swarm.wire.messages.vehicles import Fleet, VehicleState
 
@@ -74,28 +71,6 @@ def test_a_window_counts_what_came_between_its_ends_in_any_order() -> None:
 
 
 # --- several sizes ----------------------------------------------------------------------------------------------
-
-
-def test_what_must_not_be_is_named_and_a_series_goes_on_after_a_size_that_fails(monkeypatch) -> None:
-    def measure(size: Any, *_: object) -> dict[str, Any]:
-        if size.vehicles == 200:
-            raise SwarmError("it did not come up")
-        if size.vehicles == 400:
-            raise KeyboardInterrupt
-        return {"collisions": 2 if size.vehicles == 300 else 0, "lethal_entries": None}
-
-    monkeypatch.setattr(sizes, "measure_live", measure)
-    found = sizes.run_sizes([size_of(n) for n in (100, 200, 300, 400, 500)], 1.0, False)
-    assert [each["vehicles"] for each in found["rows"]] == [100, 200, 300]
-    assert found["mode"] == "live processes"
-    assert found["broken"] == [
-        "interrupted",
-        "200 vehicles: not measured: it did not come up",
-        "300 vehicles: 2 collisions",
-    ]
-    json.dumps(found, allow_nan=False)
-    with pytest.raises(SwarmError, match="it did not come up"):
-        sizes.run_sizes([size_of(200)], 1.0, False)
 
 
 # --- crowds ------------------------------------------------------------------------------------------------------

@@ -5,7 +5,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import rerun as rr
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -16,7 +15,6 @@ from support.monitor_rig import Rig, hill, little_scenario, little_terrain
 from launch_scripts.monitor.ground_colours import (
     FOUND,
     LETHAL_MARK,
-    NO_GO,
     OVERRULED,
     STILL_HIDDEN_LETHAL,
     STILL_HIDDEN_SLOW,
@@ -24,16 +22,13 @@ from launch_scripts.monitor.ground_colours import (
 )
 from launch_scripts.monitor.ground_view import (
     Area,
-    GroundView,
-    Scene,
     borders,
     closed_cells,
     ordered_areas,
     scenario_areas,
     title_places,
 )
-from launch_scripts.monitor.live_layout import COST, PHOTO
-from launch_scripts.monitor.rerun_outputs import Pen, in_markdown, shown
+from launch_scripts.monitor.rerun_outputs import in_markdown, shown
 from launch_scripts.monitor.terrain_mesh import Bytes, Floats, TerrainMesh
 from launch_scripts.observe import fact_table as facts
 from launch_scripts.observe.run_recorder import Recorder
@@ -44,7 +39,6 @@ from shared_map.learning.measurements import ONE, Measurement
 from shared_map.replication.marks import zone_author
 from shared_map.replication.replica import MapReplica
 from shared_map.terrain.terrain import Terrain, terrain_of_pace
-from swarm.clock import NS_PER_S
 from swarm.config.load import parse_scenario
 from swarm.config.scenario import Scenario
 from swarm.grid import Window
@@ -72,21 +66,6 @@ def zoned(zones: str) -> Scenario:
 
 def near(pixel: Bytes, colour: tuple[int, ...], within: int = 45) -> bool:
     return bool((np.abs(pixel.astype(int) - np.array(colour)) <= within).all())
-
-
-def test_a_zone_that_closes_ground_is_hatched_red_even_where_operators_ordered_it() -> None:
-    now = np.array(flat().ground_s_per_m)
-    now[5:15, 5:15] = np.inf
-    colours = colours_of(flat(), now)
-    found = colours.photo_of(ALL)[5:15, 5:15].reshape(-1, 3)
-    assert all(near(pixel, LETHAL_MARK) for pixel in found)
-    cells = np.flatnonzero(np.isinf(now))
-    colours.close(cells)
-    ordered = colours.photo_of(ALL)[5:15, 5:15].reshape(-1, 3)
-    assert any(near(pixel, NO_GO) for pixel in ordered)
-    assert not any(near(pixel, LETHAL_MARK) for pixel in ordered)
-    colours.close(cells[:0])
-    np.testing.assert_array_equal(colours.photo_of(ALL)[5:15, 5:15].reshape(-1, 3), found)
 
 
 def test_what_is_hidden_what_is_found_and_what_is_said_wrongly_have_colours_of_their_own() -> None:
@@ -156,33 +135,6 @@ def test_zones_of_operators_are_those_that_stand() -> None:
     assert [area.name for area in ordered_areas(replica, 10, [])] == ["z2"]
 
 
-def test_ground_that_looks_as_before_is_not_logged_again_but_for_viewers_that_come() -> None:
-    terrain = flat()
-    cost_map, replica = CostMap(terrain), MapReplica(terrain.grid)
-    scene = Scene(Pen([rr.RecordingStream("same", recording_id="r")], TerrainMesh(terrain)), [PHOTO, COST])
-    view = GroundView(scene, terrain, cost_map, replica, zoned(""))
-    logged: list[str] = []
-    view._texture = lambda layer, tile, image: logged.append(layer)  # type: ignore[method-assign]
-    both = [PHOTO.entity, COST.entity]
-
-    def logged_when(at_s: int) -> list[str]:
-        logged.clear()
-        for stale in view._stale.values():
-            stale[0] = None  # as after any mark in this tile
-        view.tick(at_s * NS_PER_S, watched=True)
-        return logged
-
-    view.begin()
-    assert logged == both
-    assert logged_when(10) == []
-    cost_map.ground_s_per_m[3, 3] = 0.5
-    assert logged_when(20) == both
-    assert logged_when(30) == []
-    view._pen.forget()
-    view.draw_anew()
-    assert logged_when(40) == both
-
-
 # --- the mesh, and words beside the view --------------------------------------------------------------------------
 
 
@@ -202,26 +154,6 @@ def test_the_tiles_of_the_ground_cover_every_cell_once_and_join_without_gaps(sha
         assert (tile.texcoords > 0).all()
         assert (tile.texcoords < 1).all()
     assert area == pytest.approx((rows - 1) * (cols - 1) * 100.0, rel=1e-4)
-
-
-def test_a_mark_on_one_cell_shows_however_far_one_looks_from() -> None:
-    terrain = hill(2100, 2100)
-    mesh, pace = TerrainMesh(terrain), np.array(terrain.pace_s_per_m)
-    pace[130, 70] = np.inf
-    (tile,) = mesh.tiles_touching(Window(130, 70, 131, 71))
-    window = mesh.tile_window(tile)
-    marked, plain = colours_of(terrain, pace).photo_of(window), colours_of(terrain).photo_of(window)
-    rows, cols = np.nonzero((marked != plain).any(axis=2))
-    assert (rows.tolist(), cols.tolist()) == ([(130 - window.row0) // 4], [(70 - window.col0) // 4])
-
-
-def test_things_stand_on_the_ground_between_cells_too() -> None:
-    terrain = hill(10, 11, top_m=100.0)
-    mesh = TerrainMesh(terrain)
-    east_m = np.array([5.0, 10.0, 55.0, 105.0, 1000.0], np.float32)
-    placed = mesh.place(east_m, np.full(5, 50.0, np.float32))
-    assert placed[:, 1].tolist() == [-50.0] * 5
-    assert (placed[:, 2] / mesh.stretch).tolist() == pytest.approx([0, 5, 50, 100, 100], abs=1e-3)
 
 
 def test_a_mark_changes_the_photo_of_the_tiles_that_show_its_cell_and_of_no_other() -> None:

@@ -109,21 +109,6 @@ def components(path: Path, entity: str, since_s: float = 0.0) -> dict[str, list[
     return {name: rows for name, rows in found.items() if rows}
 
 
-def test_an_instance_has_three_components_of_which_one_says_who_it_is(
-    scenario: Scenario, terrain: Terrain, tmp_path: Path
-) -> None:
-    """With more than three, the viewer shows only their number at the pointer."""
-    recorded(scenario, terrain, tmp_path)
-    for entity, sentence in (("/world/vehicles", "vehicle"), ("/world/targets/balls", "target")):
-        parts = components(tmp_path / "run.rrd", entity)
-        parts = {name: rows for name, rows in parts.items() if not name.endswith("RowId")}
-        assert set(parts) == {"positions", "colors", sentence}
-        assert len(parts[sentence][-1]) == len(parts["positions"][-1])
-    assert any(
-        ": following, route " in line for line in components(tmp_path / "run.rrd", "/world/vehicles")["vehicle"][-1]
-    )
-
-
 def test_whoever_opens_the_view_late_has_all_of_it_soon(
     scenario: Scenario, terrain: Terrain, tmp_path: Path
 ) -> None:

@@ -25,7 +25,6 @@ from launch_scripts.monitor.movers_view import (
     vehicle_details,
 )
 from launch_scripts.monitor.rerun_outputs import Strips
-from launch_scripts.monitor.styles import LOST_COLOUR, Looks
 from launch_scripts.monitor.terrain_mesh import TerrainMesh
 from launch_scripts.observe.latest_messages import LatestState, RunPlan, VehicleColumns
 from launch_scripts.observe.run_alarms import KINDS, Alarm
@@ -69,23 +68,6 @@ def many(strips: Strips) -> int:
 
 
 # --- looks ----------------------------------------------------------------------------------------------------
-
-
-def test_with_one_group_a_vehicle_has_its_targets_colour_and_with_several_its_groups() -> None:
-    following = np.full(3, VehicleState.FOLLOWING, np.uint8)
-    one = Looks(["all"], ["t0", "t1"])
-    rows = np.array(one.rows(["t1", "t0", None]))
-    assert one.vehicles(rows, following).tolist() == [
-        list(one.target("t1")),
-        list(one.target("t0")),
-        [170, 176, 182],
-    ]
-    assert one.target("t0") != one.target("t1")
-    two = Looks(["scouts", "trucks"], ["t0", "t1"])
-    rows = np.array(two.rows(["scouts", "trucks", "strangers"]))
-    assert len({tuple(colour) for colour in two.vehicles(rows, following).tolist()}) == 3
-    assert two.target("t0") == two.target("t1")
-    assert one.target("t0", lost=True) == two.target("t0", lost=True) == LOST_COLOUR
 
 
 # --- what a person reads --------------------------------------------------------------------------------------
