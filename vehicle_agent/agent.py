@@ -532,24 +532,22 @@ class Agent:
 
     def _take(self, vehicle: Vehicle, target: str, route: Route, now_ns: int, pushed: bool) -> list[Followed]:
         searching = route.status is RouteStatus.SEARCHING
-        if searching and not math.isfinite(route.cost_s):
-            if not pushed:
-                vehicle.no_answer(now_ns)
-            return []
         if route.status is not RouteStatus.OK and not searching:
             if not pushed:
                 self.goals.refused[vehicle.id] = route.status
                 vehicle.refuse_route(target, route.status, now_ns)
             return []
-        if searching and target not in self._unseen and target in self.lost(now_ns):
-            self._unseen.add(target)
-            self._poses.pop(target, None)
         try:
             cells = walk(self._map.grid, route.start, route.directions)
         except ValueError:
+            cells = []
+        if not cells or (searching and not math.isfinite(route.cost_s)):
             if not pushed:
                 vehicle.no_answer(now_ns)
             return []
+        if searching and target not in self._unseen and target in self.lost(now_ns):
+            self._unseen.add(target)
+            self._poses.pop(target, None)
         partial = route.remaining_s > 0.0
         turns = route.turns if self._pulled else ()
         given = GivenRoute(

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -52,8 +51,6 @@ class OwnTime:
         self._ticked_ns = now_ns
         return self._own_ns
 
-
-log = logging.getLogger(__name__)
 
 _FIRST_ANSWERS_NS = 3 * NS_PER_S // 10
 """A new generation waits this time for the others' answers before it begins. What comes later counts as well."""

@@ -42,7 +42,7 @@ from vehicle_agent.start_cells import spawn_cells
 
 _MOST_STEPS_CELLS = 1 << 21
 """Each cell has eight steps: more would take seconds and gigabytes."""
-_TRAPS_SHARE = 0.01
+_ONE_WAY_SHARE = 0.01
 
 
 def files_of(scenario: Scenario) -> dict[str, str]:
@@ -119,10 +119,10 @@ def meets(scenario: Scenario) -> Iterator[Finding]:
     for endpoint in scenario.network.connect:
         # Beyond this machine a port may be forwarded.
         if is_loopback(host_port(endpoint)[0]) and endpoint.rpartition(":")[2] not in listens:
-            listened = ", ".join(scenario.network.listen)
             yield failure(
                 "network.connect",
-                f"found {endpoint}, but the router of this scenario listens at {listened} (network.listen)",
+                f"found {endpoint}, but the router of this scenario listens at"
+                f" {', '.join(scenario.network.listen)} (network.listen)",
             )
 
 
@@ -215,7 +215,8 @@ def shards(scenario: Scenario, grid: GridSpec) -> Iterator[Finding]:
 
 
 def one_way_ground(scenario: Scenario, terrain: Terrain, truth: Floats) -> Iterator[Finding]:
-    """Ground which vehicles of a class can enter and not leave, as they climb less steep slopes than they descend.
+    """Ground which vehicles of a class can only enter, or only leave, as they climb less steep slopes than they
+    descend.
 
     Larger terrains than `_MOST_STEPS_CELLS` are not looked at.
     """
@@ -224,28 +225,25 @@ def one_way_ground(scenario: Scenario, terrain: Terrain, truth: Floats) -> Itera
     for name, own in class_grounds(scenario, terrain, truth).items():
         if own.terrain.climb is None:
             continue
-        share = traps(TrueTerrain(terrain.grid, own.truth, own.terrain.climb, own.homes))
-        if share >= _TRAPS_SHARE:
+        share = one_way_share(TrueTerrain(terrain.grid, own.truth, own.terrain.climb, own.homes))
+        if share >= _ONE_WAY_SHARE:
             whom = "vehicles" if name == GROUND else f"vehicles of the class {name}"
             yield warning(
                 "cost",
-                f"{share:.0%} of the ground that {whom} reach leads nowhere: they can enter it downhill, cannot"
-                " climb out, and strand there; raise max_climb_deg, lower max_descent_deg, or close it by a zone",
+                f"no way leads both to and from {share:.0%} of the ground where {whom} start: they drive in or out"
+                " downhill, and strand; raise max_climb_deg, lower max_descent_deg, or close it by a zone",
             )
 
 
-def traps(ground: TrueTerrain) -> float:
-    """Returns the share of cells without a way back, among those to which ways lead from the largest part in which
-    each cell is reached from each other."""
+def one_way_share(ground: TrueTerrain) -> float:
+    """Returns the share of the connected ground outside the largest part in which each cell is reached from each
+    other."""
     from scipy.sparse import csgraph
 
     _, graph = ground.steps_graph(Window(0, 0, ground.grid.rows, ground.grid.cols))
     _, parts = csgraph.connected_components(graph, directed=True, connection="strong")
-    sizes = counted(parts, int(parts.max()) + 1)
-    reached = csgraph.breadth_first_order(
-        graph, int((parts == sizes.argmax()).argmax()), directed=True, return_predecessors=False
-    )
-    return float(1.0 - sizes.max() / len(reached))
+    sizes = counted(parts[ground.home], int(parts.max()) + 1)
+    return float(1.0 - sizes.max() / len(ground.home))
 
 
 def _targets(scenario: Scenario, terrain: Terrain, truth: Floats, homes: Bools) -> Iterator[Finding]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Callable, Collection
 
 import msgspec
@@ -13,8 +12,6 @@ from swarm.config.scenario import Scenario
 from swarm.errors import SwarmError
 from swarm.peers import job_of, ranked_id
 from swarm.runtime.order_book import OrderBook
-
-log = logging.getLogger(__name__)
 
 LEAVES_TO_OTHERS_S = 3.0
 """A launcher of a part of a swarm starts such a planner only if none has appeared for this time."""

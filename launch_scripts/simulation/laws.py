@@ -6,7 +6,8 @@
     obstacles are avoided                no vehicle enters a cell that an obstacle had closed in time
     acknowledged marks stay           what a keeper said it had committed is on its disk
     no wait without a reason          of ten seconds while everything works
-    vehicles are routed again         within five seconds of the last fault
+    vehicles are routed again         within five seconds of the last fault, or say that they are stranded, and
+                                      no way leads to any target
     marks reach everybody             what an agent said four seconds before the end, every process holds
     replicas are equal                once no process publishes anything new
 """
@@ -25,6 +26,7 @@ import numpy as np
 from launch_scripts.simulation.faults import OBSERVER
 from launch_scripts.simulation.simulate import Simulation
 from launch_scripts.simulation.simulated_process import Node
+from launch_scripts.simulation.world.walks import TrueTerrain
 from planner_service.search.search_triggers import LISTEN_NS
 from shared_map.replication.replica import MapReplica
 from shared_map.vehicle_class_grounds import class_grounds
@@ -122,7 +124,7 @@ class LawBook:
     longest       when that wait was last seen, vehicle and cell
     whole_s       when all processes worked for the first time since the quiet began; None until then
     routed_s      vehicle -> when it first had a route after that, to its target or to where it searches for it, or
-                  its target within reach
+                  its target within reach; or was rightly stranded
     """
 
     def __init__(self, simulation: Simulation) -> None:
@@ -138,7 +140,7 @@ class LawBook:
         self.routed_s: dict[str, float] = {}
         scenario, grid = simulation.scenario, simulation.terrain.grid
         grounds = class_grounds(scenario, simulation.terrain, simulation.truth)
-        self._truths = {name: each.truth.reshape(-1) for name, each in grounds.items()}
+        self._grounds = {of: TrueTerrain(grid, g.truth, g.terrain.climb, g.homes) for of, g in grounds.items()}
         self._across_m = math.sqrt(2) * grid.resolution_m / scenario.time_scale
         plans = plan_agents(scenario)
         self._vehicles = [id for plan in plans for id in plan.vehicle_ids]
@@ -160,9 +162,8 @@ class LawBook:
     # --- while it runs --------------------------------------------------------------------------------------
 
     def _booted(self, node: Node) -> None:
-        self._cells.pop(
-            node.name, None
-        )  # simulated vehicles are nowhere until the new generation has places for them
+        # Simulated vehicles are nowhere until the new generation has places for them.
+        self._cells.pop(node.name, None)
         self._generations[node.name] = _Generation()
 
     def _delivered(self, now_ns: int, source: str, destination: str, topic: str, payload: bytes) -> None:
@@ -185,13 +186,11 @@ class LawBook:
         if not isinstance(node.service, AgentService):
             return
         agent, now_ns = node.service.agent, simulation.scheduler.clock.now_ns()
-        generation, cells = (
-            self._generations.setdefault(node.name, _Generation()),
-            self._cells.setdefault(node.name, {}),
-        )
-        ticked_ns = now_ns if generation.ticked_ns is None else generation.ticked_ns
-        generation.ticked_ns = now_ns
-        truth = self._truths[agent.plan.group.vehicle_class]
+        generation = self._generations.setdefault(node.name, _Generation())
+        cells = self._cells.setdefault(node.name, {})
+        ticked_ns, generation.ticked_ns = generation.ticked_ns or now_ns, now_ns
+        ground = self._grounds[agent.plan.group.vehicle_class]
+        truth = ground.pace_s_per_m.reshape(-1)
         for id, vehicle in agent.vehicles.items():
             if cells.get(id) != vehicle.cell:
                 if not math.isfinite(truth[vehicle.cell]):
@@ -202,14 +201,21 @@ class LawBook:
             generation.placed.add(id)
             cells[id] = vehicle.cell
             self._unmoved.pop(id, None)
-            if self.whole_s is not None and vehicle.state in _ROUTED:
-                self.routed_s.setdefault(id, now_s)
+            if self.whole_s is not None and id not in self.routed_s and self._routed(ground, vehicle):
+                self.routed_s[id] = now_s
             to_go = vehicle.state in _UNDER_WAY and not (agent.stopped(id) or id in agent.shut_in)
             counts_s = 0.0 if disturbed else (now_ns - ticked_ns) / NS_PER_S
             self._wait(vehicle, to_go, counts_s, self._across_m * truth.item(vehicle.cell))
         if agent.holdings.replaced:
             cells.clear()  # the younger generation drives them
         self._collide()
+
+    def _routed(self, ground: TrueTerrain, vehicle: Vehicle) -> bool:
+        """Returns True if a vehicle has a route, or is stranded and in truth no way leads from it to a target."""
+        if vehicle.state is not VehicleState.STRANDED:
+            return vehicle.state in _ROUTED
+        poses = self.simulation.recorder.observed.poses.values()
+        return ground.reached_from(vehicle.cell).isdisjoint(pose.cell for pose in poses)
 
     def _obstacles_entered(self, generation: _Generation, vehicle: Vehicle, ticked_ns: int) -> Iterator[BrokenLaw]:
         """The obstacles onto which a vehicle has driven since the last tick of its agent."""

@@ -1,4 +1,4 @@
-"""Small worlds in which swarms are tried: hills with hidden obstacles, several regions, crowds.
+"""Small worlds in which swarms are tried: hills with hidden obstacles, several regions, one-way slopes, crowds.
 
 A crowd is 8 agents with 200 vehicles on 40 x 40 cells: a hall, rooms with doors, halls joined by corridors of one
 cell, pillars.
@@ -29,11 +29,10 @@ def of_file(name: str, settings: Mapping[str, Any] | None = None) -> Scenario:
 
 
 SMALL = of_file("small")
-WIDE = of_file("wide")
 ROVERS = "rovers"
 """A crowd with 20 rovers that avoid no vehicle."""
 MIXED = ("small", "wide", *CROWDS)
-WORLDS = (*MIXED, ROVERS)
+WORLDS = (*MIXED, ROVERS, "slopes")
 _ROVERS = (
     RoverConfig(name="quick", count=8, speed_m_per_s=3.0, radius_m=1.0),
     RoverConfig(name="slow", count=8, speed_m_per_s=0.8, radius_m=4.0),
@@ -84,5 +83,5 @@ def world(name: str, seed: int) -> tuple[Scenario, Terrain]:
         return msgspec.structs.replace(scenario, name=f"rovers-{kind}", rovers=_ROVERS), terrain
     if name in CROWDS:
         return crowd(name, seed, vehicles=200, per_agent=25)
-    scenario = seeded(seed, {"small": SMALL, "wide": WIDE}[name])
+    scenario = seeded(seed, of_file(name))
     return scenario, build_terrain(scenario)

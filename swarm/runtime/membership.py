@@ -131,9 +131,10 @@ class Member:
         """True if a round of replies has ended in which not all of them named other runs."""
         self._needs: list[tuple[str, Callable[[], bool]]] = []
         self._router_appeared = False
-        """True if a router's token has risen since others were asked for their run. All are asked once a second at
-        most: a token costs its sender nothing."""
-        self._ask_due_ns = 0
+        """True if a router's token has risen since others were asked for their run."""
+        self._ask_due_ns, self._ask_wait_ns = 0, NS_PER_S
+        """Time when all may be asked again, and the wait before it. A token costs its sender nothing: while tokens
+        rise without a pause, each wait is twice the one before, up to 16 s."""
         # The first differing reply of the current round, in words.
         self._differs: RunMismatchError | None = None
         # Processes which were named already, and sentences that the next tick publishes.
@@ -184,10 +185,8 @@ class Member:
                     raise differs
                 self._asked_all = True
                 return True
-            case Appeared(peer=Peer(role=role)) if role == ROUTER:
-                self._router_appeared = True
-                return True
-            case Disappeared(peer=Peer(role=role)) if role == ROUTER:
+            case Appeared(peer=Peer(role=role)) | Disappeared(peer=Peer(role=role)) if role == ROUTER:
+                self._router_appeared |= isinstance(event, Appeared)
                 return True
             case LinkChanged(up=False, beyond=False) if self.info.role != ROUTER:
                 self._linked = False
@@ -205,7 +204,9 @@ class Member:
             self.alarms.happened("restarted", self._name, text, now_ns)
         self._now_ns = now_ns
         if self._router_appeared and now_ns >= self._ask_due_ns:
-            self._router_appeared, self._ask_due_ns = False, now_ns + NS_PER_S
+            waited_ns = 2 * self._ask_wait_ns + self._ask_due_ns - now_ns
+            self._ask_wait_ns = min(max(waited_ns, NS_PER_S), 16 * NS_PER_S)
+            self._router_appeared, self._ask_due_ns = False, now_ns + self._ask_wait_ns
             self._post(LinkChanged(up=True, beyond=True))
         for sentence in self._to_name:
             self.note(now_ns, "stranger", sentence)

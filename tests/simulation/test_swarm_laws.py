@@ -6,6 +6,7 @@ import pytest
 from support.simulated import agents, cells, simulate
 from support.vehicle_states import record, table
 
+from launch_scripts.check.scenario_check import one_way_ground
 from launch_scripts.simulation.faults import Crash, FaultPlan, Partition, random_plan
 from launch_scripts.simulation.laws import LawBook
 from launch_scripts.simulation.sample_worlds import SMALL, seeded, world
@@ -51,6 +52,14 @@ def test_the_laws_hold_under_seeded_faults(seed):
     assert report["vehicles_routed"] == 10
     assert report["captures"] > 0
     assert report["lethal_entries"] == report["payloads_dropped"] == 0
+
+
+@pytest.mark.parametrize("seed", [0, pytest.param(4, marks=pytest.mark.thorough)])
+def test_vehicles_among_one_way_slopes_have_a_route_or_say_that_they_are_stranded_and_check_warns(seed):
+    scenario, terrain = world("slopes", seed)
+    simulation = Simulation(scenario, faults=random_plan(scenario, seed, SECONDS), terrain=terrain)
+    assert "the ground where vehicles start" in next(one_way_ground(scenario, terrain, simulation.truth)).sentence
+    assert LawBook(simulation).run(SECONDS) == []
 
 
 def test_nothing_acknowledged_is_lost_and_nobody_collides_though_keeper_and_agents_die_again_and_again():

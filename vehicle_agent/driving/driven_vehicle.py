@@ -291,9 +291,7 @@ class Vehicle:
 
     def no_way(self) -> None:
         """Every planner has answered, and none knows a route from here."""
-        if not self.in_reach and not self.route.left:
-            self.state = VehicleState.STRANDED
-            self.searching = False
+        if not self.in_reach and self._strands():
             self._need = None
         self._settle()
 
@@ -379,9 +377,7 @@ class Vehicle:
         if target == self.target:
             if status is RouteStatus.NO_TARGET:
                 self._ask_later(now_ns)
-            elif not self.route.left:
-                self.state = VehicleState.STRANDED
-                self.searching = False
+            elif self._strands():
                 self._need = Reason.ASSIGNED
                 self._ask_due_ns = now_ns + _STRANDED_RETRY_NS
         self._settle()
@@ -402,6 +398,16 @@ class Vehicle:
             self._need_route(Reason.BLOCKED, now_ns)
 
     # --- inside ---------------------------------------------------------------------------------------------
+
+    def _strands(self) -> bool:
+        """Gives up its route unless it drives on along one: a route on which it stands, to where no way leads any
+        more, would hide that."""
+        strands = not self.route.left or self.motion.at_rest
+        if strands:
+            self.route.drop()
+            self.state = VehicleState.STRANDED
+            self.searching = False
+        return strands
 
     def _begin(self, given: GivenRoute, path: Sequence[int]) -> Followed:
         self._need = None

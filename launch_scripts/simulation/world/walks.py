@@ -136,6 +136,13 @@ class TrueTerrain:
             at = int(before[at])
         return way[::-1]
 
+    def reached_from(self, cell: int) -> set[int]:
+        """The cells to which a way leads from a cell, and that itself."""
+        from scipy.sparse import csgraph
+
+        _, graph = self.steps_graph(Window(0, 0, self.grid.rows, self.grid.cols))
+        return {*csgraph.breadth_first_order(graph, cell, return_predecessors=False).tolist()}
+
     def steps_graph(self, window: Window) -> tuple[NDArray[np.int64], csr_array[np.float64]]:
         """The cells of a window, int64 (n,), and the graph of all possible steps between them (n, n): an edge costs
         what the step does, in cells."""

@@ -14,7 +14,7 @@ from support.command import Swarm
 
 from launch_scripts import ports
 from launch_scripts.check import machine_check as machine
-from launch_scripts.check.scenario_check import not_made, places, shards, traps
+from launch_scripts.check.scenario_check import not_made, one_way_share, places, shards
 from launch_scripts.simulation.world.walks import TrueTerrain
 from shared_map.terrain.terrain import terrain_of_pace
 from shared_map.vehicle_class_grounds import class_grounds
@@ -222,21 +222,13 @@ class Steps:
 
 @FEW
 @given(st.lists(st.integers(0, 4), min_size=20, max_size=20))
-def test_ground_that_can_be_entered_and_not_left_is_what_steps_lead_to_and_not_back(heights: list[int]) -> None:
+def test_one_way_ground_is_all_but_the_largest_part_whose_cells_reach_each_other(heights: list[int]) -> None:
     tall = np.array(heights, np.int64).reshape(4, 5)
     ground = TrueTerrain(GridSpec(4, 5, 1.0), np.ones((4, 5), np.float32), Steps(tall))  # type: ignore[arg-type]
-
-    def reached(cell: int) -> frozenset[int]:
-        found, new = {cell}, [cell]
-        while new:
-            new = [to for at in new for _, to in ground.steps(at) if to not in found and not found.add(to)]  # type: ignore[func-returns-value]
-        return frozenset(found)
-
-    ways = {cell: reached(cell) for cell in range(20)}
-    parts = [{to for to in ways[cell] if cell in ways[to]} for cell in range(20)]
-    most = max(map(len, parts))
-    shares = {1 - most / len(ways[cell]) for cell in range(20) if len(parts[cell]) == most}
-    assert any(abs(traps(ground) - share) < 1e-9 for share in shares)
+    ways = {cell: ground.reached_from(cell) for cell in range(20)}
+    assert all(way == {cell}.union(*(ways[to] for _, to in ground.steps(cell))) for cell, way in ways.items())
+    most = max(sum(cell in ways[to] for to in ways[cell]) for cell in range(20))
+    assert abs(one_way_share(ground) - (1 - most / 20)) < 1e-9
 
 
 def test_a_machine_that_is_too_small_is_a_warning_with_what_to_do() -> None:

@@ -138,6 +138,13 @@ def test_no_way_to_its_target_leaves_it_stranded_and_it_tries_again(vehicle: Veh
     assert vehicle.state is VehicleState.FOLLOWING
 
 
+def test_one_that_stands_on_its_route_while_no_way_leads_on_is_stranded(follower: Vehicle) -> None:
+    for at_rest, state in ((False, VehicleState.FOLLOWING), (True, VehicleState.STRANDED)):
+        follower.motion.at_rest = at_rest
+        follower.no_way()
+        assert follower.state is state
+
+
 def test_a_planner_that_has_not_seen_the_target_yet_is_asked_again(vehicle: Vehicle) -> None:
     vehicle.assign("t0", S)
     vehicle.route_request(S)
@@ -177,6 +184,7 @@ def random_call(vehicle: Vehicle, chance: random.Random) -> None:
         (True, lambda: vehicle.assign(chance.choice("ab"), 0)),
         (True, lambda: vehicle.set_tracked(flag)),
         (True, vehicle.no_way),
+        *[(True, lambda: setattr(vehicle.motion, "at_rest", flag))] * 2,
         (target is not None, vehicle.release),
         (target is not None and not vehicle.planner_gone, lambda: vehicle.lose_planner(0)),
         (target is not None, lambda: vehicle.regain_planner(0)),
