@@ -16,7 +16,7 @@ from planner_service.strategy import STRATEGIES
 from planner_service.target_tree import TargetTree
 from planner_service.tree.cost_grid import CostGrid
 from shared_map.terrain.step_climb import Climb
-from swarm.config.explain import choice
+from swarm.config.explain import choice, converted
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec, Window, walk
 from swarm.wire.route_columns import Route, RouteStatus, TargetStatus, directions_of
@@ -89,9 +89,12 @@ class RouteFinder:
     Raises
     ------
     ValueError
-        On a pace that is NaN, zero or negative, an array without two dimensions, or an unknown strategy.
+        On a pace that is NaN, zero or negative, masked or true, an array without two dimensions, or an unknown
+        strategy.
     TypeError
-        On a row or column that is no whole number, or a setting that does not exist.
+        On a row or column that is no whole number.
+    ConfigError
+        On a setting that does not exist, or may not have this value.
     """
 
     def __init__(
@@ -103,26 +106,24 @@ class RouteFinder:
         climb: Climb | None = None,
         **settings: Any,
     ) -> None:
-        self._pace = np.array(pace, np.float32, order="C")
+        self._pace = _paces(pace)
         if self._pace.ndim != 2:
             raise ValueError(f"pace has {self._pace.ndim} dimensions, expected 2")
         rows, cols = self._pace.shape
         self.grid = GridSpec(rows, cols, resolution_m)
-        if (strategy := settings.setdefault("strategy", "full")) not in STRATEGIES:
+        self._config = converted({"strategy": "full", **settings}, PlannerConfig, "RouteFinder", "settings")
+        if (strategy := self._config.strategy) not in STRATEGIES:
             raise ValueError(f"strategy: found {strategy!r}{choice(strategy, tuple(STRATEGIES))}")
-        for name in settings.keys() - set(PlannerConfig.__struct_fields__):
-            raise TypeError(f"{name} is no setting{choice(name, PlannerConfig.__struct_fields__)}")
-        self._config = PlannerConfig(**settings)
         self._climb = climb
         self._tree = TargetTree(self.grid, self._config, climb)
         self._goals: GoalTrees | None = None
         self._version = 0
-        self._target = None if target is None else self._cell(*target)
+        self._target = None if target is None else self.grid.cell(*_whole(target))
         self._update([])
 
     def move(self, target: tuple[int, int]) -> None:
         """The target is in another cell. Raises OutsideGridError, and changes nothing, outside the grid."""
-        self._target = self._cell(*target)
+        self._target = self.grid.cell(*_whole(target))
         self._update([])
 
     def change(self, pace: Any, row: int = 0, col: int = 0) -> None:
@@ -130,13 +131,11 @@ class RouteFinder:
 
         Raises ValueError, and changes nothing, on a block that leaves the grid or a pace that is not positive.
         """
-        row, col = _whole(row, col)
-        block = np.atleast_2d(np.asarray(pace, np.float32))
+        row, col = _whole((row, col))
+        block = np.atleast_2d(_paces(pace))
         window = Window(row, col, row + block.shape[0], col + block.shape[1])
         if block.ndim != 2 or row < 0 or col < 0 or window.row1 > self.grid.rows or window.col1 > self.grid.cols:
             raise ValueError(f"{window} is not inside {self.grid.rows} x {self.grid.cols} cells")
-        if not (block > 0).all():
-            raise ValueError("a pace is NaN, zero or negative; lethal is inf")
         self._pace[row : window.row1, col : window.col1] = block
         self._version += 1
         if self._goals is not None:
@@ -146,7 +145,7 @@ class RouteFinder:
     def route(self, row: int, col: int | None = None) -> FoundRoute:
         """The cheapest route that is known from a cell, with its proven lower bound. Outside is a status. Raises
         TypeError unless both are whole numbers."""
-        row, col = _whole(row, col)
+        row, col = _whole((row, col))
         cell = self.grid.cell(row, col) if self.grid.inside(row, col) else -1
         found: Route = self._tree.routes([cell])[0]
         lethal = found.status is RouteStatus.NO_TARGET and self._tree.lethal_target is not None
@@ -172,7 +171,7 @@ class RouteFinder:
         is not downhill, or where the costliest cell costs some 2,900 times the cheapest, it grows over all of the
         map. Costs are in s, lengths in m, with the same meaning as of `route`.
         """
-        start, goal, grid = _whole(*start), _whole(*goal), self.grid
+        start, goal, grid = _whole(start), _whole(goal), self.grid
         if self._goals is None:
             costs = CostGrid(self.grid, self._config, self._climb)
             costs.load(self._pace)
@@ -180,10 +179,6 @@ class RouteFinder:
         at, to = (grid.cell(*end) if grid.inside(*end) else -1 for end in (start, goal))
         found = self._goals.ask(to, at, grid.cells)
         return self._found(start, found.route, found.lethal_goal)
-
-    def _cell(self, row: int, col: int) -> int:
-        """The index of a cell. Raises OutsideGridError outside."""
-        return self.grid.cell(*_whole(row, col))
 
     def pull(self, route: FoundRoute) -> PulledRoute:
         """A route pulled straight: fewer turns, less time, no lethal cell and no corner that its steps may not cut.
@@ -231,9 +226,23 @@ class RouteFinder:
             tree.take_strides(tree.stride_job()())
 
 
-def _whole(row: Any, col: Any) -> tuple[int, int]:
+def _whole(place: Any) -> tuple[int, int]:
     """A place as a cell. Raises TypeError if row or column is not whole: half a row may be half a map away."""
     try:
-        return operator.index(row), operator.index(col)
-    except TypeError as error:
-        raise TypeError(f"row {row!r}, col {col!r}: a cell is two whole numbers, such as route(1, 1)") from error
+        row, col = map(operator.index, place)
+    except (TypeError, ValueError) as error:
+        raise TypeError(f"{place!r} is no cell, which is two whole numbers, such as 1, 1") from error
+    return row, col
+
+
+def _paces(given: Any) -> NDArray[np.float32]:
+    """A copy of paces. Raises ValueError where one is no number above 0; what float32 makes inf is not lethal."""
+    values = np.asanyarray(given)
+    if values.dtype.kind not in "iuf" or np.ma.is_masked(values):
+        raise ValueError(f"pace is {values.dtype}, or masked in part; expected numbers, and inf where it is lethal")
+    with np.errstate(over="ignore"):
+        paces = np.array(values, np.float32, order="C")
+    wrong = ~(paces > 0) | (np.isinf(paces) & np.isfinite(values))
+    if wrong.any():
+        raise ValueError(f"a pace is {values[wrong][0]:g} s/m, expected 1e-38 to 3e+38, or inf where it is lethal")
+    return paces

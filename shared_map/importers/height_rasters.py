@@ -187,7 +187,8 @@ def _scale_of(dataset: Any, crs: Any, config: TerrainConfig) -> tuple[float, flo
         for part in crs.to_dict(projjson=True).get("components", [])
         for axis in part["coordinate_system"]["axis"]
     ]
-    if any(axis["direction"] == "down" for axis in axes):  # a vertical system such as EPSG:5715
+    # A vertical system such as EPSG:5715, or a variable of a netCDF.
+    if any(axis["direction"] == "down" for axis in axes) or dataset.tags(1).get("positive") == "down":
         factor, offset = -factor, -offset
         notes.append("the file states depths; heights are their negatives")
     text = str(dataset.units[0] or "").lower()

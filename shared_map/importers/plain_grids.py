@@ -162,7 +162,7 @@ class _RosMap(Struct, frozen=True):
 
     image: str
     resolution: Annotated[float, Meta(gt=0, lt=MAX_STEP)]
-    origin: Annotated[list[float], Meta(min_length=2)]
+    origin: Annotated[list[Annotated[float, Meta(ge=-_FURTHEST, le=_FURTHEST)]], Meta(min_length=2)]
     occupied_thresh: Annotated[float, Meta(ge=0, le=1)]
     free_thresh: Annotated[float, Meta(ge=0, le=1)]
     mode: Literal["trinary", "scale", "raw"] = "trinary"

@@ -34,7 +34,7 @@ from swarm.errors import TerrainError
 from swarm.grid import MAX_CELLS, GridSpec
 
 _FORMATS = tomllib.loads((Path(__file__).parent / "formats.toml").read_text(encoding="utf-8"))
-_OTHERS = _FORMATS.pop("others")
+_OTHERS, _CONVERSIONS = _FORMATS.pop("others"), _FORMATS.pop("conversions")
 _DRIVERS = {first.encode("latin-1"): key for key, row in _FORMATS.items() for first in row.get("begins", ())}
 DRIVERS_BY_ENDING = {ending: key for key, row in _FORMATS.items() for ending in row.get("endings", ())}
 _NAMELESS, _ZIPPED = (
@@ -98,7 +98,7 @@ def is_raster(path: Path) -> bool:
         return path.is_file()
     with contextlib.suppress(OSError, TerrainError):
         head, member, _ = beginning(path, tuple(_ZIPPED), FileKind.IMAGE, "")
-        return bool(_driver(head, Path(member or path).suffix.lower(), ""))
+        return bool(_driver(head, Path(member or path), ""))
     return False
 
 
@@ -308,7 +308,7 @@ def _kind_of(path: Path, what: str) -> tuple[str | Path, str, int]:
     """
     head, member, length = beginning(path, tuple(_ZIPPED), FileKind.IMAGE, what)
     named = path if member is None else Path(member)
-    driver = _driver(head, named.suffix.lower(), what if member is None else f"{what}: {member}")
+    driver = _driver(head, named, what if member is None else f"{what}: {member}")
     if driver == "VRT" and member is not None:
         raise TerrainError(f"{what}: {member} names other files; unpack it")
     check_bytes(path, FileKind.VIRTUAL_RASTER if driver == "VRT" else FileKind.IMAGE)
@@ -318,9 +318,6 @@ def _kind_of(path: Path, what: str) -> tuple[str | Path, str, int]:
         raise TerrainError(f"{what}: an .hgt says by its name where it lies, such as N46E008.hgt; rename it")
     if driver == "VRT":
         _check_virtual(path, what, {})
-    beside = path.with_suffix(".hdr")
-    if driver == "EHdr" and beside.is_file() and beside.read_bytes()[:4] == b"ENVI":
-        driver = "ENVI"
     # A mark of the order of bytes is a letter to GDAL.
     plain = f"/vsisubfile/3,{path}" if head.startswith(codecs.BOM_UTF8) else path
     return plain if member is None else f"/vsizip/{{{path}}}/{member}", driver, length
@@ -358,16 +355,15 @@ def beginning(path: Path, endings: Sequence[str], kind: FileKind, what: str) -> 
         raise TerrainError(f"{what} is damaged or no .zip: {str(error)[:LONGEST_REASON]}") from error
 
 
-def _driver(head: bytes, ending: str, what: str) -> str:
+def _driver(head: bytes, path: Path, what: str) -> str:
     text = head.removeprefix(codecs.BOM_UTF8).lstrip().lower()
     begun = (driver for magic, driver in _DRIVERS.items() if head.startswith(magic) or text.startswith(magic))
-    found = next(begun, _NAMELESS.get(ending))
-    if found is None:
-        if other := other_format(head):
-            raise TerrainError(f"{what} {other}")
-        known = ", ".join(dict.fromkeys(_DRIVERS.values()))
-        raise TerrainError(f"{what} is no raster: it begins with {head[:8]!r}, as none of {known} does")
-    return found
+    headers = path.with_suffix(".hdr"), Path(f"{path}.hdr")
+    beside = (beginning(each, (), FileKind.IMAGE, what)[0] for each in headers if each.is_file())
+    envi = ("ENVI" for header in beside if header.startswith(b"ENVI"))
+    if found := next(itertools.chain(begun, envi), _NAMELESS.get(path.suffix.lower())):
+        return found
+    raise TerrainError(f"{what} {other_format(head, f'is no raster that is read: it begins with {head[:8]!r}')}")
 
 
 def _check_virtual(path: Path, what: str, known: dict[Path, float], depth: int = 1) -> float:
@@ -387,7 +383,7 @@ def _check_virtual(path: Path, what: str, known: dict[Path, float], depth: int =
         source = path.parent / (node.text or "").strip()
         named = f"{what}: {source}"
         head, _, _ = beginning(source, (), FileKind.VIRTUAL_RASTER, named)
-        _driver(head, source.suffix.lower(), named)  # GDAL knows other kinds, also of the network
+        _driver(head, source, named)  # GDAL knows other kinds, also of the network
         if b"<VRTDataset" in head:  # anywhere, for GDAL
             if depth >= _DEEPEST:
                 raise TerrainError(f"{what} names .vrt files that name others, more than {_DEEPEST} deep")
@@ -414,11 +410,13 @@ def _painted(root: ElementTree.Element, band: ElementTree.Element) -> float:
     return max(painted / cells, 1.0)
 
 
-def other_format(head: bytes) -> str:
-    """Name of a known format which is not read, and what helps, by the first bytes; empty if it is none."""
+def other_format(head: bytes, otherwise: str = "") -> str:
+    """Name of a known format which is not read, and what helps, by the first bytes; of any other, `otherwise` and
+    what helps with most."""
     text = head.removeprefix(codecs.BOM_UTF8).decode("latin-1")
     found = ((name, how) for name, (begins, how) in _OTHERS.items() if re.search(begins, text, re.IGNORECASE))
-    return next((f"is {name}; it is not read; {how}" for name, how in found), "")
+    most = otherwise and f"{otherwise}; {_CONVERSIONS}"
+    return next((f"is {name}; it is not read; {how}" for name, how in found), most)
 
 
 # --- read ---------------------------------------------------------------------------------------------------

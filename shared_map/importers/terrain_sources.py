@@ -137,12 +137,7 @@ def _jacksboro_path() -> Path:
 
 def _from_file(path: Path, config: TerrainConfig, progress: Progress) -> Source:
     check_file(path, FileKind.TEXT_GRID)
-    suffix = path.suffix.lower()
-    if suffix not in _ENDINGS and not is_raster(path):
-        found = suffix or "a file without ending"
-        others = "`gdal_translate FILE out.tif` converts most others"
-        raise TerrainError(f"terrain {path}: {found} is unknown; give {FILE_KINDS}; {others}")
-    if suffix in _LEVEL:
+    if path.suffix.lower() in _LEVEL:
         return _map(path, config)
     from shared_map.importers.height_rasters import read_raster
 

@@ -230,6 +230,8 @@ def checked_xml(data: bytes, what: str) -> None:
             parts = _ONE_OF.get(name, ())
             if parts and (count := sum(map(held.count, parts))) != 1:  # of several, GDAL reads the last
                 raise TerrainError(f"{what} is damaged: a {name} holds {count} of {', '.join(parts)}, expected one")
+            if name == "rotation" and number_of(element.text or "0"):  # GDAL reads the overlay as if it were not
+                raise TerrainError(f"{what} has a turned overlay, which is not read; draw its area")
             if name == "NetworkLink":
                 raise TerrainError(f"{what} has a NetworkLink, which is not followed; save its areas in one file")
             if name == "way":

@@ -143,7 +143,10 @@ def read_features(layer: Layer, columns: Sequence[str]) -> Iterator[Features]:
             geometries[unclosed] = shapely.from_wkb(stored[unclosed], on_invalid="fix")
         columns_read = dict(zip(map(str, meta["fields"]), fields, strict=True))
         shapes, of = parts_of(geometries)
-        bad: dict[int, str] = {int(n): "it has no shape" for n in np.flatnonzero(shapely.is_missing(geometries))}
+        bad: dict[int, str] = {
+            int(n): "it has no shape, or one that is not read, such as a LinearRing or TIN"
+            for n in np.flatnonzero(shapely.is_missing(geometries))
+        }
         bad |= {int(n): "it, or a part of it, has no corners" for n in of[shapely.is_empty(shapes)]}
         corners, at = shapely.get_coordinates(shapes, return_index=True)
         bad |= {int(n): "its coordinates are no numbers" for n in of[at[~np.isfinite(corners).all(axis=1)]]}
@@ -187,7 +190,8 @@ def _refused(what: str) -> Iterator[None]:
         raise
     except Exception as error:  # of damaged files pyogrio raises whatever its own code runs into
         lines = str(error).strip().splitlines() or [type(error).__name__]
-        raise TerrainError(f"{what} is damaged: {lines[0][:LONGEST_REASON]}") from error
+        # After its first sentence, GDAL advises its programmers.
+        raise TerrainError(f"{what} is damaged: {lines[0].partition('. ')[0][:LONGEST_REASON]}") from error
 
 
 # --- which file ---------------------------------------------------------------------------------------------
@@ -205,12 +209,8 @@ def _source(path: Path, what: str) -> tuple[str | bytes, Kind]:
     if kind is None:
         if path.suffix.lower() in (".dbf", ".shx", ".prj"):
             raise TerrainError(f"{what} is a part of a Shapefile; name the .shp beside it")
-        if other := other_format(head):
-            raise TerrainError(f"{what} {other}")
-        raise TerrainError(
-            f"{what} is neither GeoJSON, GeoPackage, Shapefile, FlatGeobuf, KML, GPX, OSM XML, .plan nor"
-            " .waypoints, nor a .zip of one; `ogr2ogr -f GPKG out.gpkg FILE` converts most others"
-        )
+        neither = "GeoJSON, GeoPackage, Shapefile, FlatGeobuf, KML, GPX, OSM XML, .plan nor .waypoints"
+        raise TerrainError(f"{what} {other_format(head, f'is neither {neither}, nor a .zip of one')}")
     absolute = path.resolve()
     source = str(absolute) if member is None else f"/vsizip/{{{absolute}}}/{member}"
     if kind.text is None:

@@ -99,10 +99,10 @@ def _friction(zone: ZoneConfig, path: Path, grid: GridSpec, where: str) -> Burnt
     lethal = values == np.inf
     values[lethal] = np.nan
     known = values[~np.isnan(values)]
-    if known.size and not LEAST <= known.min() <= known.max() <= MOST:
-        worst = known.min() if known.min() < LEAST else known.max()
+    wrong = known[(known < LEAST) | (known > MOST)]
+    if wrong.size:
         raise TerrainError(
-            f"{what} holds {worst:g}, expected a {zone.kind} of {LEAST:g} to {MOST:g}, or inf where nothing drives"
+            f"{what} holds {wrong[0]:g}, expected a {zone.kind} of {LEAST:g} to {MOST:g}, or inf if nothing drives"
         )
     count = int(known.size + lethal.sum())
     if not count:

@@ -67,6 +67,7 @@ def reverse(f: dict[str, Any], chance: random.Random) -> None:
     )
 
 
+KINDS = ["forbidden", "water", "factor", "keep_in"]
 DAMAGES: dict[str, Damage] = {
     "open ring": opened,
     "text": lambda f, chance: spot(f["geometry"]["coordinates"], chance).__setitem__(0, ["9.0", "46.9"]),
@@ -117,12 +118,7 @@ def closed_by(file: str, kind: str) -> np.ndarray:
 
 
 @settings(max_examples=few(400))
-@given(
-    shapes(),
-    st.sampled_from(sorted(DAMAGES)),
-    st.sampled_from(["forbidden", "water", "factor", "keep_in"]),
-    st.integers(),
-)
+@given(shapes(), st.sampled_from(sorted(DAMAGES)), st.sampled_from(KINDS), st.integers())
 def test_a_damaged_feature_closes_its_ground_or_ends_the_start(tmp_path_factory, drawn, name, kind, seed):
     chance, path = random.Random(seed), tmp_path_factory.mktemp("damage") / "a.geojson"
     if kind == "keep_in":
@@ -186,6 +182,10 @@ def waypoints(*rows: tuple[int, float, Any]) -> str:
     return "\n".join(["QGC WPL 110", *lines])
 
 
+SPOT = "<Point><coordinates>9,46</coordinates></Point>"
+BOX = zip(("west", "south", "east", "north"), [*CORNERS.min(axis=0), *CORNERS.max(axis=0)], strict=True)
+SIDES = "".join(f"<{side}>{at:.10f}</{side}>" for side, at in BOX)
+PICTURE = f"<GroundOverlay><LatLonBox>{SIDES}<rotation>0</rotation></LatLonBox></GroundOverlay>"
 LATLON = [[y, x] for x, y in CORNERS]
 DISC = {"circle": {"center": MIDDLE[::-1].tolist(), "radius": 40.0}, "inclusion": False}
 FEATURE = json.dumps({"type": "Feature", "properties": {}, "geometry": shapely.geometry.mapping(
@@ -194,9 +194,9 @@ SAME = {
     "lines of geojson": FEATURE.replace("[[[", "[\n[[") + "\n",
     "geojson lines": f"{FEATURE}\n{FEATURE}\n",
     "geojson sequence": f"\x1e{FEATURE}\n\x1e{FEATURE}\n",
-    "a line of one place": f"{FEATURE}\n"
-    + json.dumps({"type": "LineString", "coordinates": [MIDDLE.tolist()] * 2}),
+    "a line of one place": f'{FEATURE}\n{{"type": "LineString", "coordinates": {[MIDDLE.tolist()] * 2}}}',
     "kml": kml(f"<Folder><name>a</name>{placemark(RING)}</Folder>"),
+    "kml with a picture that is not turned": kml(PICTURE),
     "kml with spaces": kml(placemark(RING.replace(",", ", "))),
     "open kml": kml(placemark(RING.rpartition(" ")[0])),
     "osm": osm(way(1, 2, 3, 4, 1)),
@@ -223,9 +223,9 @@ DAMAGED = {
     "kml of underscores": kml(placemark(RING.replace(f"{CORNERS[1][0]:.10f}", "9_0"))),
     "kml of one number": kml(placemark(RING + " 9.0")),
     "kml of two borders": kml(placemark(RING).replace("</Polygon>", f"{placemark(RING)[20:-22]}</Polygon>")),
-    "kml of two shapes": kml(
-        placemark(RING).replace("</Placemark>", "<Point><coordinates>9,46</coordinates></Point></Placemark>")
-    ),
+    "kml of two shapes": kml(placemark(RING).replace("</Placemark>", f"{SPOT}</Placemark>")),
+    "kml of a ring": kml(f"<Placemark>{SPOT.replace('Point', 'LinearRing')}</Placemark>"),
+    "kml of a turned picture": kml(PICTURE.replace(">0<", ">0.5<") + placemark(RING)),
     "kml without corners": kml(placemark("")),
     "kml without a shape": kml("<Placemark><name>a</name></Placemark>" + placemark(RING)),
     "linked kml": kml("<NetworkLink><Link><href>http://127.0.0.1:9/a.kml</href></Link></NetworkLink>"),
@@ -238,10 +238,7 @@ DAMAGED = {
     "system as text": f'{FEATURE[:-1]}, "crs": "EPSG:4326"}}',
     "system of no name": FEATURE[:-1] + ', "crs": {"type": "name", "properties": {"title": "EPSG:4326"}}}',
     "system unknown": FEATURE[:-1] + ', "crs": {"type": "name", "properties": {"name": "EPSG:99999"}}}',
-    "system of one feature": FEATURE
-    + "\n"
-    + FEATURE[:-1]
-    + ', "crs": {"type": "EPSG", "properties": {"code": 4326}}}',
+    "system of one feature": f'{FEATURE}\n{FEATURE[:-1]}, "crs": {{"type": "OGC", "properties": {{}}}}}}',
     "features twice": f'{{"type": "FeatureCollection", "features": [{FEATURE}], "features": []}}',
     "topojson": '{"type": "Topology", "objects": {}, "arcs": []}',
     "arcgis": '{"geometryType": "esriGeometryPolygon", "features": []}',
@@ -259,7 +256,9 @@ DAMAGED = {
 
 
 REASONS = {
-    "words": "is neither GeoJSON, GeoPackage, Shapefile",
+    "words": "is neither GeoJSON, GeoPackage, Shapefile.*gdal_translate FILE out.tif.*ogr2ogr",
+    "kml of a ring": "no shape, or one that is not read, such as a LinearRing",
+    "kml of a turned picture": "has a turned overlay",
     "elsewhere": r"reaches from 100, 20 to 100, 20, the terrain from 8\.9\S+, 46\.\S+ to 9\.\S+, 46\.\S+ in",
     "metres": "which are no degrees",
     "sqlite": "is SQLite, but no GeoPackage, perhaps SpatiaLite; it is not read; `ogr2ogr",
@@ -321,9 +320,8 @@ def test_a_part_of_another_shapefile_is_refused(tmp_path: Path) -> None:
     files = [Path(written(tmp_path / f"{n}.shp", shapes, "EPSG:4326")) for n, shapes in enumerate(sets)]
     for one, other in itertools.permutations(files, 2):
         for part in (".shp", ".shx", ".dbf", ".prj"):
-            (tmp_path / f"mixed{part}").write_bytes(
-                (other if part == ".shx" else one).with_suffix(part).read_bytes()
-            )
+            source = other if part == ".shx" else one
+            (tmp_path / f"mixed{part}").write_bytes(source.with_suffix(part).read_bytes())
         with pytest.raises(TerrainError, match=r"is damaged: its \.shx is that of another file"):
             closed_by(str(tmp_path / "mixed.shp"), "forbidden")
 

@@ -5,6 +5,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+import rasterio
+from rasterio.transform import Affine, from_origin
 from support.height_models import SIDE, hills, is_water, load, written
 
 from shared_map.array_files import Floats
@@ -12,8 +14,6 @@ from shared_map.terrain.pace_layers import TerrainClass
 
 
 def test_a_map_whose_metres_are_not_true_is_put_on_true_ones(tmp_path: Path) -> None:
-    from rasterio.transform import from_origin
-
     place = from_origin(0, 6_700_000, 100, 100)  # latitude 60: a metre of the map to the east is half a true one
     system = "+proj=eqc +lat_ts=0 +lon_0=0 +datum=WGS84 +units=m"
     source = load(written(tmp_path / "a.tif", hills(1, 500), crs=system, transform=place))
@@ -21,8 +21,6 @@ def test_a_map_whose_metres_are_not_true_is_put_on_true_ones(tmp_path: Path) -> 
 
 
 def test_pixels_that_are_square_but_for_a_rounding_are_not_resampled(tmp_path: Path) -> None:
-    from rasterio.transform import Affine
-
     ground = hills(2, 500)
     place = Affine(20, 0, 500_000, 0, -20.00001, 5_000_000)
     source = load(written(tmp_path / "a.tif", ground, transform=place))
@@ -33,8 +31,6 @@ def test_pixels_that_are_square_but_for_a_rounding_are_not_resampled(tmp_path: P
     ("unit", "metres"), [("cm", 0.01), ("[m]", 1), ("US_survey_foot", 1200 / 3937), ("ft (US)", 1200 / 3937)]
 )
 def test_units_are_known_however_they_are_written(tmp_path: Path, unit: str, metres: float) -> None:
-    import rasterio
-
     path = written(tmp_path / "a.tif", hills(2, 500) / metres)
     with rasterio.open(path, "r+") as file:
         file.units = (unit,)

@@ -81,6 +81,8 @@ WRITERS: dict[str, Callable[[Path, float], None]] = {
     "tif": lambda path, side_m: write_raster(path, side_m),
     "img": lambda path, side_m: write_raster(path, side_m, driver="HFA"),
     "bil": lambda path, side_m: write_raster(path, side_m, driver="EHdr"),
+    "dat": lambda path, side_m: write_raster(path, side_m, driver="ENVI"),
+    "raw": lambda path, side_m: write_raster(path, side_m, driver="ENVI", SUFFIX="ADD"),
     "nc": lambda path, side_m: write_netcdf(path, side_m, "NC"),
     "4.nc": lambda path, side_m: write_netcdf(path, side_m, "NC4"),
     "anything": lambda path, side_m: write_raster(path, side_m, driver="GTiff"),
@@ -98,7 +100,9 @@ WRITERS: dict[str, Callable[[Path, float], None]] = {
 def test_any_importer_keeps_a_square_metric_grid(ending, side_m, tmp_path_factory):
     path = tmp_path_factory.mktemp("kept") / f"dem.{ending}"
     WRITERS[ending](path, side_m)
-    source = load(path, crs=None if ending in ("tif", "img", "bil", "nc", "4.nc", "anything", "npz") else UTM)
+    source = load(
+        path, crs=None if ending in ("tif", "img", "bil", "dat", "raw", "nc", "4.nc", "anything", "npz") else UTM
+    )
     assert source.grid.shape == HEIGHTS.shape
     assert source.grid.resolution_m == pytest.approx(side_m, rel=1e-6)
     np.testing.assert_allclose(source.elevation_m, HEIGHTS, rtol=0, atol=1e-4)
@@ -185,9 +189,14 @@ def test_a_pipe_is_refused_at_once(tmp_path: Path, ending: str) -> None:
 
 def test_depths_are_turned_into_heights(tmp_path: Path) -> None:
     write_raster(tmp_path / "a.tif", 10.0, crs="EPSG:32632+5715")
-    source = load(tmp_path / "a.tif")
-    np.testing.assert_array_equal(source.elevation_m, -HEIGHTS)
-    assert "the file states depths; heights are their negatives" in source.notes
+    write_raster(tmp_path / "b.tif", 10.0)
+    with rasterio.open(tmp_path / "b.tif", "r+") as file:
+        file.update_tags(1, positive="down")
+    copy(tmp_path / "b.tif", tmp_path / "b.nc", driver="netCDF")
+    for name in ("a.tif", "b.nc"):
+        source = load(tmp_path / name)
+        np.testing.assert_array_equal(source.elevation_m, -HEIGHTS)
+        assert "the file states depths; heights are their negatives" in source.notes
 
 
 REAL = ["uint8", "int8", "uint16", "int16", "uint32", "int32", "uint64", "int64", "float32", "float64"]
@@ -196,6 +205,7 @@ NOTHING = "no heights at all|shows nothing of the terrain|none of its codes|no v
 ODD: dict[str, tuple[dict[str, Any], str]] = {
     **{kind: ({"dtype": kind}, "") for kind in REAL},
     **{kind: ({"dtype": kind}, rf"holds complex numbers \({kind}\), expected real ones") for kind in COMPLEX},
+    "other format": ({"driver": "PCIDSK"}, "gdal_translate FILE out.tif` converts most rasters"),
     "cells of no size": ({"transform": rasterio.Affine(np.nan, 0, WEST, 0, -10, NORTH)}, "pixels without a size"),
     **{f"scale {given}": ({"scales": (given,)}, rf"has scales \({given},\)") for given in (0.0, np.nan, np.inf)},
     **{f"half {value}": ({"dtype": "float64", "filled": value}, "") for value in (np.nan, np.inf, 1e300)},

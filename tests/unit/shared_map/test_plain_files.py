@@ -180,6 +180,7 @@ def test_ros_modes_scale_raw_and_negate(tmp_path: Path) -> None:
         (YAML, b"P5 2 1 0\n\0\0", "maxval must be greater than 0"),
         (YAML.replace("resolution: 0.05\n", ""), b"P5 1 1 255\n\0", "missing required field `resolution`"),
         (YAML.replace("0.05", "wide"), b"P5 1 1 255\n\0", "wide"),
+        (YAML.replace("-1.0", ".nan"), b"P5 1 1 255\n\0", "origin.0.: found nan"),
         (YAML.replace("0.0]", "0.7]"), b"P5 1 1 255\n\0", "turned by 0.7 rad"),
         (YAML + "mode: fancy\n", b"P5 1 1 255\n\0", "mode: found 'fancy'; allowed"),
         (YAML + "what is this\n", b"P5 1 1 255\n\0", "line 7"),
