@@ -377,6 +377,18 @@ def test_the_matrix_tries_every_topic_both_ways_where_there_are_two() -> None:
         assert {("serve", topic.name), ("ask", topic.name)} <= allowed or topic.request is None
 
 
+@pytest.mark.parametrize("said", [b"", b"\x16\x03\x01\x00\x04\x01\x00\x00\x00"], ids=["silent", "hello"])
+def test_strangers_who_hang_up_keep_no_member_out(routed: Stage, said: bytes) -> None:
+    """Without a door each of them would cost the router 0.1 s, so members would join after 40 s."""
+    host, port = host_port(routed.endpoint)
+    for _ in range(400):
+        with socket.create_connection((host, port), 10) as stranger:
+            stranger.sendall(said)
+    members = [routed.open(NAMES["agent"]) for _ in range(3)]
+    for each in members:
+        each.close()
+
+
 def test_who_fails_often_is_kept_out_and_nobody_else(routed: Stage) -> None:
     """A handshake without a certificate from 127.0.0.3, again and again; members come from 127.0.0.1."""
     host, port = host_port(routed.endpoint)

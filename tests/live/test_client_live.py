@@ -183,3 +183,20 @@ def test_a_vehicle_with_right_of_way_reserves_its_way_and_is_let_in_cell_by_cell
         other.at(*swarm.frame.centre_m(5))
         with pytest.raises(ConfigError, match="has no right of way: make it with"):
             other.may_enter(5)
+
+
+def test_orders_of_a_program_are_obeyed_and_taken_back(swarm: Swarm) -> None:
+    orders = swarm.orders()
+    assert not orders.pause().silent
+    assert [order.subject for order in orders.given()] == ["pause"]
+    assert not orders.resume().silent
+    x_m, y_m = swarm.frame.centre_m(swarm.frame.grid.cell(80, 110))
+    corners = [(x_m, y_m), (x_m + 90, y_m), (x_m + 90, y_m - 90), (x_m, y_m - 90)]
+    name, acknowledged = orders.add_zone(corners, name="works", for_s=600.0)
+    assert (name, acknowledged.silent) == ("works", [])
+    with swarm.observer() as watching:
+        eventually(lambda: sum(mark.lethal for mark in watching.marks.values()) >= 4, 5, "the zone in the map")
+    assert [zone.name for zone in orders.zones()] == ["works"]
+    assert not orders.remove_zone("works").silent
+    with pytest.raises(ConfigError, match="the order is not possible"):
+        orders.add_zone(corners[:2])

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import contextlib
+import importlib.util
 import io
+import os
+import subprocess
 import time
 import urllib.parse
 from collections.abc import Callable, Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,10 +22,13 @@ from support.fake_run import fake_run
 from support.monitor_rig import LIVE, Rig, hidden_truth, little_scenario, little_terrain
 
 from launch_scripts.monitor.live_layout import BACKGROUND
+from launch_scripts.ports import free_ports
+from launch_scripts.web.live_page import viewer_program
 
 pytestmark = [pytest.mark.browser, pytest.mark.slow]
 
 SIZE = (1280, 800)
+VULKAN = [path for folder in ("/usr/share", "/etc") for path in Path(folder, "vulkan/icd.d").glob("*.json")]
 
 
 @pytest.fixture(scope="module")
@@ -82,3 +89,38 @@ def test_a_browser_shows_the_ground_and_each_target_with_its_vehicles_and_asks_n
         assert sorted(elsewhere) == sorted(browser.refused), "what wants out is stopped by the page's policy"
     finally:
         browser.close()
+
+
+@pytest.mark.skipif(not VULKAN, reason="needs a Vulkan driver: apt-get install mesa-vulkan-drivers")
+@pytest.mark.skipif(importlib.util.find_spec("rerun_cli") is None, reason="needs rerun's viewer")
+def test_the_native_viewer_shows_the_same(shown: Rig, tmp_path: Path) -> None:
+    from rerun.experimental import ViewerClient
+
+    location, port = f"rerun+{shown.sinks.page.server.url}/proxy", free_ports(1)[0]
+    viewer = subprocess.Popen(
+        [viewer_program(), "--headless", "--bind", "127.0.0.1", "--port", str(port), "--window-size", "1280x800",
+         location],
+        env={**os.environ, "XDG_RUNTIME_DIR": str(tmp_path), "HOME": str(tmp_path), "CI": "1", "RUST_LOG": "error"},
+    )  # fmt: skip
+    try:
+        client = connected(ViewerClient, f"rerun+http://127.0.0.1:{port}/proxy")
+
+        def screenshot() -> bytes:
+            client.save_screenshot(str(tmp_path / "view.png"))
+            return (tmp_path / "view.png").read_bytes()
+
+        until_complete(screenshot, tmp_path, within_s=100)
+    finally:
+        viewer.kill()
+        viewer.wait()
+
+
+def connected(client_type: Any, url: str) -> Any:
+    deadline_s = time.monotonic() + 30
+    while True:
+        try:
+            return client_type.connect(url)
+        except Exception:  # it says in many ways that no endpoint listens yet
+            if time.monotonic() > deadline_s:
+                raise
+            time.sleep(0.2)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import subprocess
+import sys
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
@@ -96,6 +97,22 @@ def topic_of(row: str) -> str:
     return ROWS[row].topic.format(vehicle="a0_01", target="t0")
 
 
+def test_a_foreign_stack_lists_every_topic(running: Gateway) -> None:
+    program = "from zenoh_ros2_sdk.cli import main; main()"
+    # This terrain has no coordinates.
+    expected = {f"{topic_of(row)} [{ROWS[row].type_name}]" for row in OUT if row != "fix"}
+
+    def missing() -> set[str]:
+        listed = subprocess.run(
+            [sys.executable, "-c", program, "--no-daemon", "--router", f"127.0.0.1:{running.port}",
+             "topic", "list", "-t"],
+            capture_output=True, text=True, timeout=30, check=False,
+        )  # fmt: skip
+        return expected - set(listed.stdout.splitlines())
+
+    eventually(lambda: not missing(), 60, "every topic in the list")  # each is there once it has something to tell
+
+
 def test_a_latched_map_comes_to_who_comes_late(running: Gateway, session: zenoh.Session) -> None:
     node = PeerNode(session, "late", TYPES)
     maps, frames = [], []
@@ -123,6 +140,20 @@ def test_a_peer_of_another_domain_or_distribution_is_named_in_the_log(
     older.subscribe("/map", ROWS["map"].type_name, lambda message: None)
     eventually(lambda: "node old subscribes to /map as humble does" in running.said, 15, "the word about humble")
     older.close()
+
+
+def test_after_kill_9_of_the_gateway_nothing_of_it_is_left(gateway: Gateway, session: zenoh.Session) -> None:
+    there: set[str] = set()
+    node = PeerNode(session, "watcher", TYPES)
+    node.watch("0", lambda seen, is_there: there.add(seen.topic) if is_there else there.discard(seen.topic))
+    process = gateway.start()
+    try:
+        eventually(lambda: {topic_of(row) for row in OUT if row != "fix"} <= there, 40, "all topics")
+    finally:
+        process.kill()
+        process.wait(10)
+    eventually(lambda: not there, 15, "the end of all tokens")
+    node.close()
 
 
 def test_the_gateway_ends_at_ctrl_c_and_says_what_it_lacks(gateway: Gateway) -> None:

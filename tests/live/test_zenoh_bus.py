@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import signal
 import socket
 import subprocess
@@ -11,6 +12,7 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import msgspec
 import pytest
@@ -241,6 +243,25 @@ def test_a_question_that_an_inbox_decodes_wakes_no_thread_between(world):
     assert inbox.take(0) is None
 
 
+def test_threads_that_post_replies_keep_what_python_knows_of_them(world):
+    a, b = world.bus("a"), world.bus("b")
+    b.serve(RUN, answering((run_info(id="b"), {})), role="agent", id="b")
+    world.settle()
+    own = threading.local()
+    calls: list[tuple[int, int]] = []
+
+    def post(event: object) -> None:
+        own.calls = getattr(own, "calls", 0) + 1
+        calls.append((threading.get_native_id(), own.calls))
+
+    for n in range(20):
+        a.ask(RUN, Nothing(), post, tag="q")
+        world.until(lambda n=n: len(calls) == 2 * n + 2)
+    for thread in {thread for thread, _ in calls}:
+        counted = [count for each, count in calls if each == thread]
+        assert counted == list(range(1, len(counted) + 1))
+
+
 def test_garbage_is_logged_once_per_topic_whatever_its_keys(world, caplog):
     a, b, box = world.bus("a"), world.bus("b"), Box()
     b.subscribe(POSE, box)
@@ -357,6 +378,31 @@ def test_a_token_that_names_nobody_is_dropped_and_others_are_still_told(world, t
     world.until(lambda: len(box) == 2)
     assert box == [Appeared(peer), Disappeared(peer)]
     raised.undeclare()
+
+
+@pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="this system does not count wake-ups in /proc")
+def test_readers_of_what_comes_seldom_sleep_until_it_comes(world):
+    a, b = world.bus("a"), world.bus("b")
+    before = set(threading.enumerate())
+    asked_of, tokens, links = Box(), Box(), Box()
+    b.serve(RUN, asked_of, role="agent", id="b")
+    b.watch_alive(tokens)
+    b.watch_links(links)
+    world.settle()
+    readers = [thread for thread in threading.enumerate() if thread not in before]
+    assert {thread.name for thread in readers} == {"serve-run", "alive", "links"}
+
+    def woken() -> list[int]:
+        statuses = [Path(f"/proc/self/task/{thread.native_id}/status").read_text() for thread in readers]
+        return [int(re.findall(r"^voluntary_ctxt_switches:\s*(\d+)$", text, re.M)[0]) for text in statuses]
+
+    slept = woken()
+    time.sleep(1.0)  # of a channel's `recv` ten wake-ups, fewer on a busy machine
+    assert woken() == slept
+    a.declare_alive(Peer("agent", "a1", 7))
+    a.ask(RUN, Nothing(), Box(), tag="q")
+    world.settle()
+    assert len(asked_of) == len(tokens) == 1
 
 
 def test_a_router_passes_no_payload_which_is_longer_than_its_topic_allows(world):

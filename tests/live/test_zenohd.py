@@ -7,18 +7,21 @@ import time
 from collections.abc import Iterator
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 from support.processes import eventually
 from support.zenohd import Zenohd, plugins
 
+from launch_scripts.deploy.certificates import issue
 from launch_scripts.ports import free_ports
 from shared_map.replication.marks import mark_set, statements
 from shared_map.replication.replica import MapReplica
 from shared_map.replication.replica_sync import MapSync
 from swarm.bus.zenoh_bus import ZenohBus, open_bus
 from swarm.clock import MonotonicClock
-from swarm.config.scenario import MapConfig, NetworkConfig
+from swarm.config.scenario import MapConfig, NetworkConfig, TlsConfig
+from swarm.errors import BusError
 from swarm.grid import GridSpec
 from swarm.runtime.inbox import Inbox
 from swarm.wire.messages.map_data import SEQ_STEP, MarkKind
@@ -110,3 +113,27 @@ def test_an_older_set_that_the_storage_took_for_newer_replaces_nothing_where_it_
         bus.publish(MARKS, newer, region=0, tile=0, author="a0.1")  # as the author or a keeper says it again
         late.run(0.5)
         assert [each.seq for each in late.replica.held.of_tile(0)] == [5 * SEQ_STEP]
+
+
+def test_without_a_certificate_of_the_swarms_nobody_gets_in(tmp_path: Path) -> None:
+    certs, others = tmp_path / "certs", tmp_path / "others"
+    issue(certs, "router", ["localhost"], 2)
+    issue(others, "router", ["localhost"], 2)
+    endpoint = f"tls/localhost:{free_ports(1)[0]}"
+
+    def network(folder: Path) -> NetworkConfig:
+        names = (str(folder / name) for name in ("ca.pem", "router.pem", "router.key"))
+        files = TlsConfig(**dict(zip(("ca", "certificate", "key"), names, strict=True)))
+        return NetworkConfig(listen=(endpoint,), connect=(endpoint,), tls=files, connect_timeout_s=2.0)
+
+    router = Zenohd(tmp_path, network(certs), plugins())
+    try:
+        with open_bus(network(certs)):
+            pass
+        with pytest.raises(BusError, match="cannot reach a router"), open_bus(network(others)):
+            pass
+        mixed = msgspec.structs.replace(network(others).tls, ca=str(certs / "ca.pem"))  # trusts, is not trusted
+        with pytest.raises(BusError), open_bus(msgspec.structs.replace(network(others), tls=mixed)):
+            pass
+    finally:
+        router.stop()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy import ndimage
@@ -196,7 +197,15 @@ UNKNOWABLE = ("dry: salt lake",)
 """Models that no look at heights can tell from their opposite."""
 
 
-def counted(water: Bools, dry: Bools, found: Bools) -> dict[str, float]:
-    """Shares of labelled cells taken for the other kind; 0 where there are none."""
-    parts = {"missed": (water, ~found), "taken": (dry, found)}
-    return {name: (cells & wrong).sum() / max(cells.sum(), 1) for name, (cells, wrong) in parts.items()}
+def counted(water: Bools, dry: Bools, found: Bools) -> dict[str, Any]:
+    """Shares of labelled cells taken for the other kind; and the same without the cells next to a shore."""
+    shore = ndimage.binary_dilation(water, _AROUND) & ndimage.binary_dilation(dry, _AROUND)
+    shares: dict[str, Any] = {"water_cells": int(water.sum()), "dry_cells": int(dry.sum())}
+    for name, cells, wrong in (("missed", water, ~found), ("taken", dry, found)):
+        shares[name] = _share(int((cells & wrong).sum()), int(cells.sum()))
+        shares[f"{name}_off_shore"] = _share(int((cells & wrong & ~shore).sum()), int((cells & ~shore).sum()))
+    return shares
+
+
+def _share(part: int, whole: int) -> float | None:
+    return round(part / whole, 5) if whole else None

@@ -55,6 +55,18 @@ def test_an_answer_that_fits_no_question_is_left_out() -> None:
     assert samples.costs_s == {}
 
 
+@given(st.integers(1, 60), st.integers(1, 60), st.floats(-3, 3), st.floats(-3, 3))
+def test_between_samples_costs_are_linear_where_all_are_known(
+    rows: int, cols: int, down: float, right: float
+) -> None:
+    samples = CostSamples(GridSpec(rows, cols, 10.0), None)
+    plane = (10 + down * samples.rows[:, None] + right * samples.cols).astype(np.float32)
+    at_rows = np.linspace(samples.rows[0], samples.rows[-1], 7).astype(np.int64)
+    at_cols = np.linspace(samples.cols[0], samples.cols[-1], 5).astype(np.int64)
+    found = samples.spread(plane, at_rows, at_cols)
+    np.testing.assert_allclose(found, 10 + down * at_rows[:, None] + right * at_cols, atol=1e-3)
+
+
 @given(st.integers(0, 2**32 - 1))
 def test_the_coarse_tree_leads_downhill_and_never_through_a_wall(seed: int) -> None:
     rng = np.random.default_rng(seed)

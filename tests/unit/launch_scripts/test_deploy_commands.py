@@ -114,3 +114,23 @@ def test_zenohd_admits_the_processes_of_a_scenario_and_needs_one_with_certificat
     assert config["transport"]["link"]["tls"]["listen_certificate"] == str(certs / "router.0.pem")
     assert run("zenohd", out, "--force", "--listen", "tcp/127.0.0.1:7447").exit_code == 0
     assert "access_control" not in json.loads(out.read_text())
+
+
+def test_a_plan_is_shown_and_written_for_each_machine(tmp_path: Path, scenario: Path) -> None:
+    machines = "".join(f'[[hosts]]\nname = "m{n}"\naddress = "10.0.0.{n}"\n' for n in (1, 2, 3))
+    hosts, kits = tmp_path / "hosts.toml", tmp_path / "kits"
+    hosts.write_text(machines)
+    shown = run("plan", scenario, "--hosts", hosts)
+    assert shown.exit_code == 0
+    assert {"m1", "m2", "m3"} <= set(shown.stdout.split())
+    assert "the run continues without any 1 of its 3 machines" in shown.stdout
+    assert " records the run and writes its report" in shown.stdout
+    assert not kits.exists()
+    told = run("plan", scenario, "--hosts", hosts, "--out", kits, "--json")
+    plan = json.loads(told.stdout)
+    assert plan["archives"] == [str(kits / f"m{n}.tar.gz") for n in (1, 2, 3)]
+    names = [process["certificate"] for host in plan["hosts"] for process in host["processes"]]
+    assert {path.stem for path in (kits / "certs").glob("*.key")} == {
+        "ca", "operator.0", *(f"operator.m{n}" for n in (1, 2, 3)), *names,
+    }  # fmt: skip
+    assert "operator.anna" not in names

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import rerun as rr
 from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -13,32 +14,41 @@ from support.map_strategies import set_of
 from support.monitor_rig import Rig, hill, little_scenario, little_terrain
 
 from launch_scripts.monitor.ground_colours import (
+    FAST_MARK,
     FOUND,
     LETHAL_MARK,
+    NO_GO,
     OVERRULED,
+    SLOW_MARK,
     STILL_HIDDEN_LETHAL,
     STILL_HIDDEN_SLOW,
     GroundColours,
 )
 from launch_scripts.monitor.ground_view import (
     Area,
+    GroundView,
+    Scene,
     borders,
     closed_cells,
     ordered_areas,
     scenario_areas,
     title_places,
 )
-from launch_scripts.monitor.rerun_outputs import in_markdown, shown
+from launch_scripts.monitor.live_layout import COST, PHOTO
+from launch_scripts.monitor.rerun_outputs import Pen, in_markdown, shown
 from launch_scripts.monitor.terrain_mesh import Bytes, Floats, TerrainMesh
 from launch_scripts.observe import fact_table as facts
+from launch_scripts.observe.palette import rgb
 from launch_scripts.observe.run_recorder import Recorder
 from launch_scripts.report.report_json import make_report, write_report
+from launch_scripts.report.run_picture import QUICKER, SLOWER, learned_pixels
 from shared_map.cost_map import CostMap
 from shared_map.learning.learned_factors import LearnedGauges
 from shared_map.learning.measurements import ONE, Measurement
 from shared_map.replication.marks import zone_author
 from shared_map.replication.replica import MapReplica
 from shared_map.terrain.terrain import Terrain, terrain_of_pace
+from swarm.clock import NS_PER_S
 from swarm.config.load import parse_scenario
 from swarm.config.scenario import Scenario
 from swarm.grid import Window
@@ -66,6 +76,32 @@ def zoned(zones: str) -> Scenario:
 
 def near(pixel: Bytes, colour: tuple[int, ...], within: int = 45) -> bool:
     return bool((np.abs(pixel.astype(int) - np.array(colour)) <= within).all())
+
+
+def test_ground_that_was_known_to_be_lethal_looks_neither_like_open_ground_nor_like_a_mark() -> None:
+    closed = np.zeros((40, 50), np.bool_)
+    closed[10:30, 10:30] = True
+    changed = (colours_of(flat(closed)).photo_of(ALL) != colours_of(flat()).photo_of(ALL)).any(axis=2)
+    np.testing.assert_array_equal(changed, closed)
+    pixels = colours_of(flat(closed)).photo_of(ALL)[closed]
+    assert len(np.unique(pixels, axis=0)) >= 2, "hatched, not filled: to be told apart without colour"
+    marks = (LETHAL_MARK, SLOW_MARK, FAST_MARK)
+    assert not any(near(pixel, mark) for pixel in pixels[:40] for mark in marks)
+
+
+def test_a_zone_that_closes_ground_is_hatched_red_even_where_operators_ordered_it() -> None:
+    now = np.array(flat().ground_s_per_m)
+    now[5:15, 5:15] = np.inf
+    colours = colours_of(flat(), now)
+    found = colours.photo_of(ALL)[5:15, 5:15].reshape(-1, 3)
+    assert all(near(pixel, LETHAL_MARK) for pixel in found)
+    cells = np.flatnonzero(np.isinf(now))
+    colours.close(cells)
+    ordered = colours.photo_of(ALL)[5:15, 5:15].reshape(-1, 3)
+    assert any(near(pixel, NO_GO) for pixel in ordered)
+    assert not any(near(pixel, LETHAL_MARK) for pixel in ordered)
+    colours.close(cells[:0])
+    np.testing.assert_array_equal(colours.photo_of(ALL)[5:15, 5:15].reshape(-1, 3), found)
 
 
 def test_what_is_hidden_what_is_found_and_what_is_said_wrongly_have_colours_of_their_own() -> None:
@@ -135,6 +171,33 @@ def test_zones_of_operators_are_those_that_stand() -> None:
     assert [area.name for area in ordered_areas(replica, 10, [])] == ["z2"]
 
 
+def test_ground_that_looks_as_before_is_not_logged_again_but_for_viewers_that_come() -> None:
+    terrain = flat()
+    cost_map, replica = CostMap(terrain), MapReplica(terrain.grid)
+    scene = Scene(Pen([rr.RecordingStream("same", recording_id="r")], TerrainMesh(terrain)), [PHOTO, COST])
+    view = GroundView(scene, terrain, cost_map, replica, zoned(""))
+    logged: list[str] = []
+    view._texture = lambda layer, tile, image: logged.append(layer)  # type: ignore[method-assign]
+    both = [PHOTO.entity, COST.entity]
+
+    def logged_when(at_s: int) -> list[str]:
+        logged.clear()
+        for stale in view._stale.values():
+            stale[0] = None  # as after any mark in this tile
+        view.tick(at_s * NS_PER_S, watched=True)
+        return logged
+
+    view.begin()
+    assert logged == both
+    assert logged_when(10) == []
+    cost_map.ground_s_per_m[3, 3] = 0.5
+    assert logged_when(20) == both
+    assert logged_when(30) == []
+    view._pen.forget()
+    view.draw_anew()
+    assert logged_when(40) == both
+
+
 # --- the mesh, and words beside the view --------------------------------------------------------------------------
 
 
@@ -154,6 +217,37 @@ def test_the_tiles_of_the_ground_cover_every_cell_once_and_join_without_gaps(sha
         assert (tile.texcoords > 0).all()
         assert (tile.texcoords < 1).all()
     assert area == pytest.approx((rows - 1) * (cols - 1) * 100.0, rel=1e-4)
+
+
+def test_a_mark_on_one_cell_shows_however_far_one_looks_from() -> None:
+    terrain = hill(2100, 2100)
+    mesh, pace = TerrainMesh(terrain), np.array(terrain.pace_s_per_m)
+    pace[130, 70] = np.inf
+    (tile,) = mesh.tiles_touching(Window(130, 70, 131, 71))
+    window = mesh.tile_window(tile)
+    marked, plain = colours_of(terrain, pace).photo_of(window), colours_of(terrain).photo_of(window)
+    rows, cols = np.nonzero((marked != plain).any(axis=2))
+    assert (rows.tolist(), cols.tolist()) == ([(130 - window.row0) // 4], [(70 - window.col0) // 4])
+
+
+def test_things_stand_on_the_ground_between_cells_too() -> None:
+    terrain = hill(10, 11, top_m=100.0)
+    mesh = TerrainMesh(terrain)
+    east_m = np.array([5.0, 10.0, 55.0, 105.0, 1000.0], np.float32)
+    placed = mesh.place(east_m, np.full(5, 50.0, np.float32))
+    assert placed[:, 1].tolist() == [-50.0] * 5
+    assert (placed[:, 2] / mesh.stretch).tolist() == pytest.approx([0, 5, 50, 100, 100], abs=1e-3)
+
+
+def test_gentle_land_is_stretched_and_a_void_is_level_with_the_lowest_ground() -> None:
+    terrain = hill(100, 100, top_m=5.0)
+    elevation_m = np.array(terrain.elevation_m) + 300
+    elevation_m[3, 3] = np.nan
+    mesh = TerrainMesh(terrain_of_pace(np.ones((100, 100), np.float32), 10.0, elevation_m))
+    assert mesh.stretch == 8.0
+    assert mesh.heights_m[3, 3] == 0.0
+    assert mesh.heights_m.max() == pytest.approx(40.0)
+    assert TerrainMesh(hill(100, 100, top_m=500.0)).stretch == 1.0
 
 
 def test_a_mark_changes_the_photo_of_the_tiles_that_show_its_cell_and_of_no_other() -> None:
@@ -223,6 +317,15 @@ def learned(**keys: float) -> tuple[CostMap, list[MarkSet]]:
     words = {FLAT: said(keys["flat"]), STEEP: said(keys["steep"])}
     sets = MapReplica(GROUND.grid, cost_map, author="all.a1.1").write_learned(words, 1)
     return cost_map, sets
+
+
+def test_the_picture_of_a_report_shows_factors_but_on_lethal_ground() -> None:
+    cost_map, _ = learned(flat=3.0, steep=0.4)
+    pixels = learned_pixels(GROUND, cost_map.factors)
+    assert tuple(pixels[30, 10, :3]) == rgb(SLOWER)
+    assert tuple(pixels[30, 40, :3]) == rgb(QUICKER)
+    assert pixels[30, 10, 3] > pixels[30, 40, 3] > 100
+    assert (pixels[:5, :5] == 0).all()
 
 
 def test_a_planner_tells_the_mean_factor_of_a_class_until_its_prior_stands_again() -> None:

@@ -215,6 +215,14 @@ def test_items_are_asked_for_in_any_order_again_and_beyond_the_end() -> None:
     assert upload.accepted
 
 
+def test_a_vehicle_that_asks_without_end_is_given_up() -> None:
+    upload = Upload([codec.MissionItem(0, codec.NAV_WAYPOINT, codec.ABOVE_HOME, 1.0, 2.0, 0.0)])
+    for _ in range(100):
+        upload.on_mission_message(codec.ItemAsked(0))
+        upload.tick(0)
+    assert upload.why
+
+
 # --- the wheel ---------------------------------------------------------------------------------------------------
 
 
@@ -310,6 +318,14 @@ def test_ardupilot_gets_the_next_turn_each_second_and_its_own_place_when_the_swa
     world.adapter.hear_swarm(False)
     holds = [each for each in world.run(10.0) if isinstance(each, codec.Setpoint)]
     assert places(holds) == [GRID.cell(40, 39)] * 3  # type: ignore[arg-type]
+
+
+def test_what_was_steered_before_the_link_was_lost_is_not_held_when_it_is_back() -> None:
+    world = driving(GUIDED)
+    world.speaks = False
+    world.run(8.0)
+    world.speaks = True
+    assert not [each for each in world.run(3.0) if isinstance(each, codec.Setpoint)]
 
 
 def test_a_copter_in_guided_takes_off_once() -> None:

@@ -1,6 +1,7 @@
 """The monitor: listens, records, serves on loopback, and delays no other process."""
 
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -26,12 +27,14 @@ from shared_map.terrain.terrain import Terrain
 from swarm.bus.bus import Event, Heard
 from swarm.clock import NS_PER_S
 from swarm.config.scenario import MonitorConfig, Scenario
+from swarm.errors import BusError
+from swarm.peers import Peer
 from swarm.wire.fields import pack_column
 from swarm.wire.messages.orders import GoalState, GoalStates
 from swarm.wire.messages.planning import Believed, Sighted
 from swarm.wire.messages.processes import Stats
-from swarm.wire.messages.vehicles import Obstacle
-from swarm.wire.topics import STATS, TOPICS
+from swarm.wire.messages.vehicles import Followed, Obstacle
+from swarm.wire.topics import FOLLOWED, STATS, TOPICS
 
 
 @pytest.fixture(scope="module")
@@ -107,6 +110,21 @@ def components(path: Path, entity: str, since_s: float = 0.0) -> dict[str, list[
             rows = [row for t, row in zip(at_s, batch.column(name).to_pylist(), strict=True) if t >= since_s]
             found.setdefault(name.rpartition(":")[2], []).extend(row for row in rows if row is not None)
     return {name: rows for name, rows in found.items() if rows}
+
+
+def test_an_instance_has_three_components_of_which_one_says_who_it_is(
+    scenario: Scenario, terrain: Terrain, tmp_path: Path
+) -> None:
+    """With more than three, the viewer shows only their number at the pointer."""
+    recorded(scenario, terrain, tmp_path)
+    for entity, sentence in (("/world/vehicles", "vehicle"), ("/world/targets/balls", "target")):
+        parts = components(tmp_path / "run.rrd", entity)
+        parts = {name: rows for name, rows in parts.items() if not name.endswith("RowId")}
+        assert set(parts) == {"positions", "colors", sentence}
+        assert len(parts[sentence][-1]) == len(parts["positions"][-1])
+    assert any(
+        ": following, route " in line for line in components(tmp_path / "run.rrd", "/world/vehicles")["vehicle"][-1]
+    )
 
 
 def test_whoever_opens_the_view_late_has_all_of_it_soon(
@@ -208,6 +226,21 @@ def test_no_recording_replaces_another(tmp_path: Path) -> None:
     assert [new_recording_path(tmp_path).name for _ in range(3)] == ["run.rrd", "run-2.rrd", "run-3.rrd"]
 
 
+def test_a_route_that_leaves_the_map_is_counted_and_not_drawn(
+    scenario: Scenario, terrain: Terrain, tmp_path: Path
+) -> None:
+    rig = Rig(scenario, terrain, None)
+    rig.speaker.publish(
+        FOLLOWED,
+        Followed(vehicle="v", target="t0", start=0, directions=b"\x00", cost_s=1.0, lower_bound_s=1.0),
+        agent="a0",
+        vehicle="v",
+    )
+    rig.run(1)
+    assert rig.service.counters.counts["routes_unreadable"] == 1
+    rig.close()
+
+
 def test_where_to_watch_is_told_to_whoever_begins_to_listen_later(scenario: Scenario, terrain: Terrain) -> None:
     rig = Rig(scenario, terrain, None, web_port=9090)
     rig.run(30)
@@ -217,6 +250,23 @@ def test_where_to_watch_is_told_to_whoever_begins_to_listen_later(scenario: Scen
     rig.close()
     told = [event.message for event in heard if isinstance(event, Heard)]
     assert [stats.web_port for stats in told if isinstance(stats, Stats) and stats.role == "monitor"][:1] == [9090]
+
+
+def test_who_comes_and_who_goes_is_in_the_log_and_who_was_there_is_not(
+    scenario: Scenario, terrain: Terrain
+) -> None:
+    rig = Rig(scenario, terrain, None)
+    told: list[str] = []
+    rig.service._panel.note = lambda text, level: told.append(text)  # type: ignore[method-assign]
+    rig.bus("early").declare_alive(Peer("agent", "a0", 7))
+    rig.run(3)
+    bus = rig.bus("late")
+    bus.declare_alive(Peer("agent", "a1", 7))
+    rig.run(1)
+    bus.close()
+    rig.run(1)
+    rig.close()
+    assert told == ["agent a1 is up", "agent a1 is gone"]
 
 
 def test_a_monitor_speaks_of_nothing_but_itself(scenario: Scenario, terrain: Terrain) -> None:
@@ -327,3 +377,15 @@ time.sleep(60)
         eventually(lambda: b"sleep" in (child / "cmdline").read_bytes(), 10)
         parent.send_signal(signal.SIGKILL)
     eventually(lambda: not child.exists() or "\nState:\tZ" in (child / "status").read_text(), 10)
+
+
+@pytest.mark.network
+def test_a_taken_port_is_one_clear_sentence(terrain: Terrain, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("launch_scripts.web.live_page.PORT_PATIENCE_S", 0.2)
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        config = MonitorConfig(web_port=port)
+        with pytest.raises(
+            BusError, match=rf"monitor\.web_port {port} cannot be opened: Address already in use; choose another"
+        ):
+            Sinks("r", None, config, make_blueprint(TerrainMesh(terrain)))

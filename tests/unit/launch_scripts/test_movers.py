@@ -2,6 +2,8 @@
 
 import itertools
 import json
+import re
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -24,11 +26,13 @@ from launch_scripts.monitor.movers_view import (
     target_labels,
     vehicle_details,
 )
-from launch_scripts.monitor.rerun_outputs import Strips
+from launch_scripts.monitor.rerun_outputs import Pen, RateLimit, Strips
+from launch_scripts.monitor.styles import HUES, LOST_COLOUR, Looks
 from launch_scripts.monitor.terrain_mesh import TerrainMesh
 from launch_scripts.observe.latest_messages import LatestState, RunPlan, VehicleColumns
 from launch_scripts.observe.run_alarms import KINDS, Alarm
 from launch_scripts.observe.run_state import state_of
+from launch_scripts.plain_text import Duration
 from swarm.clock import NS_PER_S
 from swarm.config.load import parse_scenario
 from swarm.grid import GridSpec, walk
@@ -68,6 +72,50 @@ def many(strips: Strips) -> int:
 
 
 # --- looks ----------------------------------------------------------------------------------------------------
+
+
+# Simulated dichromacy, by Machado, Oliveira and Fernandes (2009), severity 1.
+DICHROMATS = {
+    "protan": [[0.152, 1.053, -0.205], [0.115, 0.786, 0.099], [-0.004, -0.048, 1.052]],
+    "deutan": [[0.367, 0.861, -0.228], [0.280, 0.673, 0.047], [-0.012, 0.043, 0.969]],
+}
+
+
+@pytest.mark.parametrize("who", DICHROMATS)
+def test_the_colour_blind_tell_groups_and_targets_apart(who: str) -> None:
+    def seen(colour: tuple[int, int, int]) -> NDArray[np.float64]:
+        linear = (np.array(colour) / 255) ** 2.2
+        return np.asarray(np.clip(np.array(DICHROMATS[who]) @ linear, 0, 1) ** (1 / 2.2) * 255)
+
+    for one, other in itertools.combinations(HUES, 2):
+        assert np.linalg.norm(seen(one) - seen(other)) > 35, (one, other)
+
+
+def test_with_one_group_a_vehicle_has_its_targets_colour_and_with_several_its_groups() -> None:
+    following = np.full(3, VehicleState.FOLLOWING, np.uint8)
+    one = Looks(["all"], ["t0", "t1"])
+    rows = np.array(one.rows(["t1", "t0", None]))
+    assert one.vehicles(rows, following).tolist() == [
+        list(one.target("t1")),
+        list(one.target("t0")),
+        [170, 176, 182],
+    ]
+    assert one.target("t0") != one.target("t1")
+    two = Looks(["scouts", "trucks"], ["t0", "t1"])
+    rows = np.array(two.rows(["scouts", "trucks", "strangers"]))
+    assert len({tuple(colour) for colour in two.vehicles(rows, following).tolist()}) == 3
+    assert two.target("t0") == two.target("t1")
+    assert one.target("t0", lost=True) == two.target("t0", lost=True) == LOST_COLOUR
+
+
+@pytest.mark.parametrize("groups", [["all"], ["scouts", "trucks"], [f"g{n}" for n in range(30)]])
+def test_the_legend_explains_every_state_and_kind_once(groups: list[str]) -> None:
+    legend = Looks(groups, ["t0", "t1"]).legend()
+    meanings = [look.meaning for look in legend]
+    assert len(meanings) == len(set(meanings)) <= 15
+    said = " ".join(meanings)
+    words = ("arrived", "waiting", "stranded", "lost", "target", "seen", "obstacle", "route", "alarm")
+    assert not [word for word in words if word not in said]
 
 
 # --- what a person reads --------------------------------------------------------------------------------------
@@ -124,6 +172,16 @@ def test_alarms_are_marked_where_they_are_until_they_have_been_over_for_a_while(
         f"{each.label}: {each.about}" in seen and (each.place(grid) or each.target == "t0") for each in alarms
         if each.over_s is None or each.over_s >= 50 - OVER_S
     )  # fmt: skip
+
+
+def test_an_alarm_has_the_place_of_its_cell_or_of_its_target() -> None:
+    def places(**about: Any) -> list[tuple[float, float]]:
+        alarm = Alarm(kind="down", text=".", since_s=0.0, **about)
+        return list(alarm_marks([alarm], 9.0, {"t0": (30.0, 40.0)}, hill(20, 20).grid))
+
+    assert places(about="x", cell=21, target="t0") == [(15.0, 15.0)]
+    assert places(about="planner-t0", target="t0") == [(30.0, 40.0)]
+    assert places(about="keeper-0") == places(about="planner-t9", target="t9") == []
 
 
 # --- places and lines -----------------------------------------------------------------------------------------
@@ -231,6 +289,26 @@ def test_whom_nobody_knows_the_camera_cannot_follow(name: str) -> None:
 # --- how much and how often -----------------------------------------------------------------------------------
 
 
+def test_what_is_due_is_due_once_in_its_time() -> None:
+    limit = RateLimit({"often": 0.5, "seldom": 2.0})
+    times_s = np.arange(0, 10, 0.1)
+    often = [t for t in times_s if limit.due("often", int(round(t, 1) * NS_PER_S))]
+    seldom = [t for t in times_s if limit.due("seldom", int(round(t, 1) * NS_PER_S))]
+    assert len(often) == 20
+    assert len(seldom) == 5
+
+
+def test_of_what_is_drawn_only_what_differs_is_news_until_it_is_forgotten() -> None:
+    pen = Pen([], TerrainMesh(hill(4, 4)))
+    here, there = np.zeros((2, 3), np.float32), np.ones((2, 3), np.float32)
+    assert pen.news("a", positions=here, labels=["x", "y"]).keys() == {"positions", "labels"}
+    assert pen.news("a", positions=here.copy(), labels=["x", "y"]) == {}
+    assert pen.news("a", positions=there, labels=None).keys() == {"positions"}
+    assert pen.news("a", positions=there[:1], labels=["x", "y"]).keys() == {"positions"}
+    pen.forget()
+    assert pen.news("a", positions=there[:1], labels=["x", "y"]).keys() == {"positions", "labels"}
+
+
 # --- an alarm may name any cell that a tracker or planner tells of its target, and say anything -------------------
 
 GRID = GridSpec(4, 7, 10.0)
@@ -263,3 +341,14 @@ def test_an_alarm_is_one_line_that_no_terminal_obeys_whatever_a_process_says(
     assert alarm.line(GRID).isprintable()
     if text.isprintable():
         assert alarm.text == text
+
+
+def test_no_message_says_since_and_a_number_of_seconds() -> None:
+    """A moment is `at 14:22:10`, a duration `for 19 min` (`launch_scripts.plain_text`)."""
+    since = re.compile(r"\b[Ss]ince (\$?\{|%[.\d]|\d+ (s|min|h)\b)")
+    parts = ("swarm", "shared_map", "planner_service", "vehicle_agent", "launch_scripts")
+    files = [path for part in parts for path in (Path(__file__).parents[3] / part).rglob("*.*")]
+    texts = [path for path in files if path.suffix in (".py", ".js", ".j2", ".json", ".yml")]
+    assert len(texts) > 300
+    assert [path for path in texts if since.search(path.read_text(encoding="utf-8"))] == []
+    assert [str(Duration(s)) for s in (86, 1140, 19_200, 90_000)] == ["86 s", "19 min", "5 h 20 min", "1 d 1 h"]

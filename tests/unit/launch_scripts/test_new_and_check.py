@@ -1,6 +1,7 @@
 """`swarm new` and `swarm check`: what the one writes, the other accepts; what the other says, is so."""
 
 import json
+import sys
 import typing
 from pathlib import Path
 
@@ -19,6 +20,8 @@ from launch_scripts.simulation.world.walks import TrueTerrain
 from shared_map.terrain.terrain import terrain_of_pace
 from shared_map.vehicle_class_grounds import class_grounds
 from swarm.config.agent_plan import PLACE_TREES_BYTES, plan_agents
+from swarm.config.explain import expected, meanings
+from swarm.config.ground import TerrainConfig
 from swarm.config.load import load_scenario, parse_scenario, read_scenario
 from swarm.config.scenario import GroupConfig, Scenario, TargetConfig
 from swarm.config.setting_types import Preset, Walk
@@ -62,6 +65,36 @@ def test_new_shares_many_vehicles_out_over_few_agents(tmp_path: Path, swarm: Swa
         name = f"my{vehicles}.toml"
         assert swarm(f"new {name} --vehicles {vehicles}")[0] == 0
         assert len(plan_agents(load_scenario(tmp_path / name))) == agents
+
+
+def test_every_key_that_new_writes_stands_below_its_meaning(tmp_path: Path, swarm: Swarm) -> None:
+    """The meanings are those of which the reference is made."""
+    assert swarm("new my.toml --terrain jacksboro")[0] == 0
+    lines = (tmp_path / "my.toml").read_text().splitlines()
+    assert max(map(len, lines)) <= 110
+    comment: list[str] = []
+    keys = 0
+    every = {
+        (key, meaning)
+        for section in (Scenario, *(kind for kind in _sections()))
+        for key, meaning in meanings(section).items()
+    }
+    for line in lines:
+        if line.startswith("#"):
+            comment.append(line[2:])
+            continue
+        if line and not line.startswith("["):
+            keys += 1
+            said = " ".join(comment)
+            key = line.partition(" = ")[0]
+            assert any(said.startswith(f"{meaning}; ") for name, meaning in every if name == key), line
+        comment = []
+    assert keys > 15
+
+
+def _sections() -> list[type[typing.Any]]:
+    modules = [vars(sys.modules[each.__module__]) for each in (Scenario, TerrainConfig)]
+    return [each for module in modules for each in module.values() if isinstance(each, type(Scenario))]
 
 
 def test_nothing_is_written_over(tmp_path: Path, swarm: Swarm) -> None:
@@ -261,3 +294,7 @@ def test_a_check_refuses_a_function_of_another_library_as_the_run_does(key: str)
     assert (refused.level, refused.about) == ("failure", key)
     assert "'os:system' could not be made: TypeError" in refused.text
     assert list(not_made(parse_scenario("[[targets]]"), GridSpec(4, 5, 10.0), np.ones((4, 5), np.float32))) == []
+
+
+def test_a_choice_is_said_with_all_that_it_allows() -> None:
+    assert expected(typing.Literal["a", "b"] | None) == "one of 'a', 'b'"

@@ -10,8 +10,12 @@ from typing import Annotated
 import msgspec
 import pytest
 
-from docs.generate import scenario_page
+from docs.generate import scenario_page, wire_page
+from docs.generate.__main__ import PROCESS, SWARM, command_line
+from launch_scripts import cli
+from launch_scripts.typer_commands import Family
 from swarm.config.scenario import Scenario
+from swarm.wire.topics import TOPICS
 
 ROOT = Path(__file__).parents[3]
 
@@ -51,6 +55,15 @@ def test_a_key_without_a_row_is_refused_by_page_and_schema():
             make(Unexplained)
 
 
+def test_every_key_of_every_section_is_on_the_page():
+    page = scenario_page.PATH.read_text(encoding="utf-8")
+    for path, section in scenario_page._sections(Scenario):
+        assert f"## `{path}`" in page or path == ""
+        for field in msgspec.structs.fields(section):
+            key = field.encode_name
+            assert f"| `{key}` |" in page or f".{key}]" in page or f"[{key}]" in page
+
+
 @pytest.mark.parametrize(
     "scenario", sorted((ROOT / "launch_scripts" / "scenarios").glob("*.toml")), ids=lambda p: p.stem
 )
@@ -69,6 +82,32 @@ def test_the_schema_knows_every_key_of_a_shipped_scenario_and_no_other(scenario)
                 check(inner, kind["items"])
 
     check(tomllib.loads(scenario.read_text(encoding="utf-8")), schema)
+
+
+def test_every_command_and_option_of_the_command_line_is_on_the_page():
+    page = (
+        command_line()
+        .replace("[the swarm](#shared-options)", SWARM)
+        .replace("[a process](#shared-options)", PROCESS)
+    )
+    for name, command in cli.command().commands.items():
+        section = page.partition(f"## `swarm {name}`\n")[2].partition("\n## `")[0]
+        assert section
+        for param in (each for each in command.params if not getattr(each, "hidden", False)):
+            assert any(name in section for name in (*param.opts, param.metavar or param.name.upper()))
+        if isinstance(command, Family):
+            assert all(f"### `swarm {name} {inner}`" in section for inner in command.group.commands)
+
+
+def test_every_key_message_and_field_is_on_the_page():
+    page = wire_page.document()
+    for topic in TOPICS:
+        assert f"| `{topic.key}` |" in page
+        for message in filter(None, (topic.message, topic.request)):
+            assert f"### {message.__name__}\n" in page
+            assert f'"{message.__struct_config__.tag}"' in page
+            for field in message.__struct_fields__:
+                assert re.search(rf"^    {field} +\S", page, re.MULTILINE)
 
 
 _FILE = re.compile(r"`((?:[\w.-]+/)+[\w-]+\.(?:py|toml|md|sh|yml|json))`")

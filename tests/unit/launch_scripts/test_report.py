@@ -5,6 +5,7 @@ import json
 import re
 from pathlib import Path
 
+import msgspec
 import numpy as np
 import pytest
 from matplotlib.figure import Figure
@@ -23,6 +24,7 @@ from launch_scripts.report.report_json import TABLES, make_report, write_report
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.clock import NS_PER_S
 from swarm.config.load import load_scenario, parse_scenario
+from swarm.config.scenario import Scenario
 from swarm.config.write import scenario_text
 from swarm.errors import ConfigError, StoreError
 from swarm.files import write_file
@@ -127,6 +129,19 @@ def test_a_scenario_that_was_written_is_read_as_the_same_from_any_folder(name: s
     written.write_text(scenario_text(scenario, tmp_path))
     assert load_scenario(written) == scenario
     assert scenario_text(load_scenario(written), Path("/nowhere")) == scenario_text(scenario, tmp_path)
+
+
+def test_every_setting_that_has_a_value_is_written(tmp_path: Path) -> None:
+    written = scenario_text(Scenario(), tmp_path)
+
+    def keys(struct: msgspec.Struct) -> set[str]:
+        values = {each.encode_name: getattr(struct, each.name) for each in msgspec.structs.fields(struct)}
+        inner = [value for value in values.values() if isinstance(value, msgspec.Struct)]
+        inner += [each for value in values.values() if isinstance(value, tuple) for each in value]
+        own = {key for key, value in values.items() if value is not None}
+        return own.union(*(keys(each) for each in inner if isinstance(each, msgspec.Struct)))
+
+    assert [key for key in sorted(keys(Scenario())) if key not in written] == []
 
 
 def test_a_relative_path_of_a_scenario_leads_to_the_same_file_when_written(tmp_path: Path) -> None:

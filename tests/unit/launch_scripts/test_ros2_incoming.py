@@ -1,8 +1,10 @@
 """Messages from ROS are hostile until they are read: none raises, and the results are always valid."""
 
 import math
+import random
 import threading
 from collections.abc import Callable
+from contextlib import suppress
 from itertools import pairwise
 from types import SimpleNamespace
 from typing import Any
@@ -11,6 +13,7 @@ import numpy as np
 import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
+from support.effort import few
 from support.ros_messages import path
 from support.ros_node import FakeNode
 
@@ -28,7 +31,7 @@ from launch_scripts.gateways.ros2.ros_messages import RosMap, RosMessages, quate
 from launch_scripts.gateways.ros2.ros_node import Input, WorkQueue
 from launch_scripts.gateways.ros2.ros_types import types_of
 from swarm.clock import NS_PER_S
-from swarm.errors import ConfigError
+from swarm.errors import ConfigError, ProtocolError
 from swarm.grid import GridSpec
 from swarm.wire.messages.vehicles import MOST_M_PER_S
 
@@ -257,6 +260,24 @@ def test_any_polygon_is_corners_on_the_terrain_or_a_sentence(points: Any, frame:
     else:
         assert len(found) == 0 or 3 <= len(found) <= 256
         assert all(GRID.cell_at(*corner) >= 0 for corner in found)
+
+
+def test_bytes_that_unpack_at_all_are_read_without_raising() -> None:
+    """Messages of real types, as they come from the wire, with any bytes changed."""
+    chance, read = random.Random(1), 0
+    messages = RosMessages(TYPES, MAP)
+    good = messages.odometry(0, ("map", "uav"), (*GRID.centre_m(40), 1.0), 2.0, 0.0)
+    pose = messages.pose_stamped(0, *GRID.centre_m(40), 1.0)
+    for number in range(few(3000)):
+        kind, made = (KINDS[0], good) if number % 2 else (KINDS[1], pose)
+        content = bytearray(TYPES.pack(made, kind))
+        for _ in range(chance.randrange(12)):
+            content[chance.randrange(4, len(content))] = chance.choice([0, 127, 128, 255, chance.randrange(256)])
+        with suppress(ProtocolError):
+            found = tried(robot_place, FrameReader(MAP, "uav/odom"), TYPES.unpack(bytes(content), kind))
+            assert isinstance(found, (str, Place))
+            read += 1
+    assert read > few(3000) / 3
 
 
 # --- settings --------------------------------------------------------------------------------------------------

@@ -267,6 +267,23 @@ def test_the_log_has_every_note_alarm_and_capture(
 # --- the file -----------------------------------------------------------------------------------------------------
 
 
+def test_the_file_is_indexed_compressed_in_order_and_says_which_run_it_is(recording: Path) -> None:
+    with recording.open("rb") as file:
+        reader = make_reader(file)
+        assert reader.get_header().profile == "ros2"
+        summary = reader.get_summary()
+        assert summary.statistics is not None
+        assert {each.topic for each in summary.channels.values()} == TOPICS
+        assert {each.message_encoding for each in summary.channels.values()} == {"cdr"}
+        assert {each.encoding for each in summary.schemas.values()} == {"ros2msg"}
+        assert {each.compression for each in summary.chunk_indexes} == {"zstd"}
+        (about,) = reader.iter_metadata()
+        assert (about.metadata["run"], about.metadata["crs"]) == ("r1", "EPSG:32632")
+        times = [message.log_time for *_, message in reader.iter_messages(log_time_order=False)]
+        assert times == sorted(times)
+        assert len(times) == summary.statistics.message_count
+
+
 def test_an_older_run_has_no_map_and_says_so(run: Path, tmp_path: Path, swarm: Swarm) -> None:
     old = tmp_path / "old"
     old.mkdir()

@@ -246,8 +246,11 @@ def test_a_vehicle_that_crosses_into_another_region_is_counted_once_where_it_is_
     assert vehicles.east_m.tolist() == [10.0, 30.0]
     assert vehicles.chasing("t0").tolist() == [0, 1]
     assert vehicles.chasing("t1").tolist() == []
-    states = recorder.summary(2 * NS_PER_S).states
-    assert {state: many for state, many in states.items() if many} == {"following": 1, "arrived": 1}
+    summary = recorder.summary(2 * NS_PER_S)
+    assert summary.states == {
+        "idle": 0, "waiting": 0, "following": 1, "arrived": 1, "stranded": 0, "lost": 0,
+            "outdated": 0, "searching": 0,
+    }  # fmt: skip
 
 
 def capture(target: str, cell: int) -> Note:
@@ -359,7 +362,15 @@ def test_of_a_target_that_only_vehicles_see_its_planner_tells_whether_it_is_lost
 
 
 def test_the_run_is_ready_when_all_processes_are_alive_and_a_vehicle_has_a_route(recorder: Recorder) -> None:
-    for n, (role, id) in enumerate(recorder.observed.plan.crew):
+    peers = [
+        ("keeper", "k0"),
+        ("targets", "d0"),
+        ("planner", "t0"),
+        ("planner", "t1"),
+        ("agent", "a0"),
+        ("agent", "a1"),
+    ]
+    for n, (role, id) in enumerate(peers):
         assert recorder.ready_ns is None
         recorder.alive(Peer(role, id, 1), True, n)
     assert recorder.observed.missing() == []

@@ -11,8 +11,10 @@ from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
 
+import psutil
 import pytest
 from support import contained
+from support.processes import eventually
 
 from launch_scripts.launcher.signals import StopAsked
 from launch_scripts.stop_requests import stop_requests
@@ -152,6 +154,23 @@ def test_a_request_is_known_though_a_library_swallows_the_exception(number: sign
 
 
 # --- processes that ./launch_scripts/test starts end with it ----------------------------------------------------
+
+STARTS = """
+import subprocess, sys, time
+child = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"], start_new_session=True)
+print(child.pid, flush=True)
+time.sleep(60)
+"""
+
+
+@pytest.mark.parametrize("number", [signal.SIGTERM, signal.SIGHUP])
+def test_what_a_stopped_command_leaves_in_another_session_is_ended(number: signal.Signals) -> None:
+    command = [sys.executable, str(Path(contained.__file__)), sys.executable, "-c", STARTS]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, stderr=subprocess.DEVNULL, text=True) as process:
+        orphan = int(process.stdout.readline())
+        process.send_signal(number)
+        assert process.wait(30) != 0
+    eventually(lambda: not psutil.pid_exists(orphan), 5, "the end of the orphan")
 
 
 @pytest.mark.parametrize("code", [0, 5])

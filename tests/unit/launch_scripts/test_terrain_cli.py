@@ -96,6 +96,28 @@ def test_a_picture_of_any_shape_with_voids_and_coarsened(
     assert (tmp_path / "look.png").stat().st_size > 10_000
 
 
+def test_classify_prints_what_it_found_and_how_well(made: Path, tmp_path: Path) -> None:
+    spots = {"forest": [], "grass": []}
+    from shared_map.terrain.synthetic import landscape
+
+    _, classes = landscape(300, 280, 30.0, 400.0, 4)
+    rng = np.random.default_rng(1)
+    for name, kind in (("forest", 2), ("grass", 4)):
+        for cell in rng.choice(np.flatnonzero(classes == kind), 12, replace=False):
+            row, col = divmod(int(cell), 280)
+            spots[name].append([col * 30 + 15, row * 30 + 15])
+    labels = "".join(f'[[labels]]\nclass = "{name}"\npoints_m = {points}\n' for name, points in spots.items())
+    (tmp_path / "labels.toml").write_text(labels)
+    said = run(
+        "classify", made / "dem.tif", made / "photo.tif", "--labels", tmp_path / "labels.toml",
+        "--out", tmp_path / "classes.tif",
+    )  # fmt: skip
+    assert "forest" in said
+    assert "learnt, on polygons not seen" in said
+    with rasterio.open(tmp_path / "classes.tif") as file:
+        assert set(np.unique(file.read(1))) == {2, 4}
+
+
 def test_a_terrain_file_is_told_its_vehicles_by_an_option_and_a_scenario_says_them_itself(tmp_path: Path) -> None:
     file = tmp_path / "hill.npz"
     row, col = np.mgrid[:20, :20]

@@ -1,11 +1,14 @@
 """Completion, help and exit codes of the whole command: every sub-command, found by walking its tree."""
 
+import inspect
 import os
 import signal
 import subprocess
 import sys
+from collections.abc import Iterator
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import pytest
 from support.command import Swarm
@@ -26,12 +29,73 @@ def offered(*words: str) -> list[str]:
     return [item.value for item in shell.get_completions(list(words[:-1]), words[-1])]
 
 
+def commands(group: Any = None, path: tuple[str, ...] = ()) -> Iterator[tuple[tuple[str, ...], Any]]:
+    """Every command with the words that call it."""
+    group = command() if group is None else group
+    yield path, group
+    for name in group.list_commands(None) if hasattr(group, "list_commands") else ():
+        yield from commands(group.get_command(None, name), (*path, name))
+
+
+EVERY = list(commands())
+
+
 def test_a_duration_is_a_number_of_seconds_or_has_a_unit() -> None:
     parse = duration(least_s=0.1).parser
     assert [parse(text) for text in ("90", "90s", "1.5 min", "2m", "2h", "1d")] == [90, 90, 90, 120, 7200, 86400]
     for text in ("", "5minutes", "0", "nan", "inf", "s", "1e99d"):
         with pytest.raises(BadParameter, match="such as 90, 90s, 10min"):
             parse(text)
+
+
+def test_every_command_completes_its_options_and_its_sub_commands() -> None:
+    for path, each in EVERY:
+        declared = {name for param in each.params for name in param.opts if name.startswith("--")}
+        assert declared | {"--help"} <= {*offered(*path, "--"), "--help"}, path
+        assert declared <= set(offered(*path, "--")), path
+        if hasattr(each, "list_commands"):
+            assert each.list_commands(None) == [name for name in offered(*path, "") if name[0] != "-"], path
+
+
+def test_every_command_answers_to_h_as_to_help(swarm: Swarm, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    for path, each in EVERY:
+        if hasattr(each, "list_commands") or path[0] in ("up", "new", "check", "doctor"):
+            code, said, _ = told = swarm("", *path, "-h")
+            assert (code, told) == (0, swarm("", *path, "--help")), path
+            assert f"Usage: {' '.join(['swarm', *path])} " in said
+            assert max(map(len, said.splitlines())) <= 80
+        # The others inherit it.
+        assert each.context_settings.get("help_option_names", ["-h"])[0] == "-h", path
+
+
+def test_the_short_help_fits_a_terminal(swarm: Swarm, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    rows = swarm("-h")[1].splitlines()
+    names = [
+        row.split()[0] for row in inspect.cleandoc(cli.Root.__doc__ or "").splitlines() if row.startswith("  ")
+    ]
+    assert len(rows) + len(names) - sum(row.startswith("  ") and row[2] != " " for row in rows) <= 24
+    assert max(map(len, rows)) < 80
+    assert len(names) == 12
+
+
+def test_every_option_has_one_name_and_says_what_it_is() -> None:
+    for path, each in EVERY:
+        for param in each.params:
+            assert param.help, (path, param.name)
+            names = [name for name in param.opts if len(name) > 2 or name[0] != "-"]  # a letter may be beside it
+            assert len(names) <= 1, (path, param.opts)
+            assert not param.secondary_opts, (path, param.secondary_opts)
+
+
+def test_every_command_that_does_something_shows_an_example() -> None:
+    silent = [
+        " ".join(path)
+        for path, each in EVERY
+        if not hasattr(each, "list_commands") and f"swarm {' '.join(path)}" not in (each.help or "")
+    ]
+    assert silent == []
 
 
 @pytest.fixture

@@ -13,6 +13,24 @@ from shared_map.array_files import Floats
 from shared_map.terrain.pace_layers import TerrainClass
 
 
+@pytest.mark.parametrize(
+    ("system", "step"),
+    [
+        ("+proj=longlat +R=1737400 +no_defs", 0.01),
+        ("+proj=stere +lat_0=-90 +lon_0=0 +R=3376200 +units=m +no_defs", 300.0),
+        ("IAU_2015:30100", 0.01),
+    ],
+)
+def test_other_planets_have_metres_of_their_own(tmp_path: Path, system: str, step: float) -> None:
+    from rasterio.transform import from_origin
+
+    path = written(tmp_path / "moon.tif", hills(1, 500), crs=system, transform=from_origin(0, 1, step, step))
+    source = load(path)
+    expected_m = step if step > 1 else step * np.pi / 180 * 1_737_400
+    assert source.grid.resolution_m == pytest.approx(expected_m, rel=0.02)
+    assert not np.isnan(source.elevation_m).any()
+
+
 def test_a_map_whose_metres_are_not_true_is_put_on_true_ones(tmp_path: Path) -> None:
     place = from_origin(0, 6_700_000, 100, 100)  # latitude 60: a metre of the map to the east is half a true one
     system = "+proj=eqc +lat_ts=0 +lon_0=0 +datum=WGS84 +units=m"

@@ -20,8 +20,10 @@ from shared_map.terrain.pace_layers import (
 )
 from shared_map.terrain.row_bands import padded_rows
 from shared_map.terrain.slope_rules import slope_factor
+from shared_map.terrain.terrain import build_terrain
 from shared_map.terrain.zones import paint_zones, zone_mask
 from swarm.config.ground import CostConfig, SlopeRule, TerrainConfig, ZoneConfig
+from swarm.config.scenario import Scenario
 from swarm.errors import TerrainError
 from swarm.grid import GridSpec
 
@@ -152,6 +154,16 @@ def test_a_mask_without_a_painted_cell_is_refused_by_its_name(tmp_path: Path) ->
     Image.new("L", (30, 20)).save(tmp_path / "none.png")
     with pytest.raises(TerrainError, match=r"'rough' covers no cell of the terrain: .*none\.png is 0 everywhere"):
         zone_mask(ZoneConfig(kind="rough", mask=str(tmp_path / "none.png")), GridSpec(20, 30, 10.0))
+
+
+def test_a_zone_outside_the_terrain_is_refused_with_a_sentence() -> None:
+    far = ZoneConfig(kind="forbidden", name="swamp", polygon_m=((900, 900), (950, 900), (950, 950)))
+    with pytest.raises(TerrainError, match=r"'swamp' covers no cell.* 300 m x 200 m"):
+        zone_mask(far, GridSpec(20, 30, 10.0))
+    with pytest.raises(TerrainError, match="covers no cell"):
+        build_terrain(
+            Scenario(terrain=TerrainConfig(source="synthetic", rows=20, cols=30), cost=CostConfig(zones=(far,)))
+        )
 
 
 def test_a_zone_may_be_a_painted_mask(tmp_path: Path) -> None:

@@ -13,6 +13,7 @@ from support.effort import few
 from shared_map.terrain.pace_layers import terrain_pace
 from shared_map.terrain.slope_rules import SLOPE_RULES, directional_factor, slope_factor
 from shared_map.terrain.step_climb import ENTRIES, Climb, climb_of
+from shared_map.terrain.terrain import build_terrain
 from swarm.config.cost_rules import PRESETS, check_cost, cost_of_preset
 from swarm.config.ground import CostConfig
 from swarm.config.load import load_scenario, parse_scenario
@@ -153,6 +154,17 @@ def test_a_step_of_just_the_limit_is_allowed_and_a_hair_more_is_not() -> None:
             climb = climb_on(np.array([[0.0, rise_m * share]]), cost)
             assert climb.allows(0, 1) == climb.allows(1, 0) == allowed
     assert "none is steeper than 60 degrees up or 60 degrees down" in climb.note
+
+
+def test_a_terrain_says_its_rule_and_its_preset() -> None:
+    def notes(more: str) -> tuple[str, ...]:
+        text = f'[terrain]\nsource = "synthetic"\nrows = 40\ncols = 40\n[cost]\n{more}'
+        return build_terrain(parse_scenario(text)).notes
+
+    level = "no preset: 10 m/s (36 km/h) on level open ground"
+    assert f"{level}, slope rule quadratic, each step by its way up or down" in notes("directional = true")
+    hiker = "preset hiker: 0.84 m/s (3.02 km/h) on level open ground, slope rule tobler, the mean of up and down"
+    assert any(note.startswith(hiker) for note in notes('preset = "hiker"'))
 
 
 # --- presets ----------------------------------------------------------------------------------------------------

@@ -8,6 +8,7 @@ import msgspec
 import numpy as np
 import pytest
 from scipy import ndimage
+from support.height_models import written
 
 from shared_map.terrain.pace_layers import TerrainClass
 from shared_map.terrain.store import (
@@ -20,16 +21,38 @@ from shared_map.terrain.store import (
     scenario_key,
 )
 from shared_map.terrain.terrain import build_terrain, terrain_of_pace
+from shared_map.terrain.true_ground import build_truth
 from swarm.config.ground import CostConfig, TerrainConfig, ZoneConfig
+from swarm.config.load import load_scenario
 from swarm.config.scenario import Scenario
 from swarm.errors import StoreError, TerrainError
 from swarm.runtime.role_setup import RoleSetup
 
+SCENARIOS = Path(__file__).parents[3] / "launch_scripts" / "scenarios"
 SMALL = Scenario(seed=2, terrain=TerrainConfig(source="synthetic", rows=48, cols=64, relief_m=150))
 
 
 def with_cost(**changes: object) -> Scenario:
     return msgspec.structs.replace(SMALL, cost=CostConfig(**changes))
+
+
+def test_jacksboro_is_mountains_with_roads_lakes_and_cliffs_on_square_metres() -> None:
+    scenario = load_scenario(SCENARIOS / "jacksboro.toml")
+    terrain = build_terrain(scenario)
+    assert (terrain.grid.rows, terrain.grid.cols, terrain.grid.resolution_m) == (424, 400, 75.0)
+    assert terrain.elevation_m.dtype == np.float32
+    assert 236 <= terrain.elevation_m.min() < 260
+    assert 1040 < terrain.elevation_m.max() <= 1076
+    passable = np.isfinite(terrain.pace_s_per_m)
+    assert 0.01 < 1 - passable.mean() < 0.10
+    labels, _ = ndimage.label(passable)
+    assert np.bincount(labels.ravel())[1:].max() > 0.99 * passable.sum()
+    assert (terrain.pace_s_per_m[terrain.classes == TerrainClass.ROAD] == np.float32(1 / 20)).all()
+    assert (terrain.classes == TerrainClass.WATER).sum() > 300
+    assert terrain.photo.shape == (424, 400, 3)
+    truth = build_truth(scenario, terrain)
+    assert (np.isinf(truth) & passable).sum() > 500
+    assert ((truth > terrain.pace_s_per_m) & np.isfinite(truth)).sum() > 500
 
 
 def test_the_same_scenario_gives_the_same_digest_and_another_rule_another() -> None:
@@ -124,3 +147,35 @@ def test_a_small_synthetic_terrain_is_built_too() -> None:
     for rows, cols in ((1, 1), (2, 3), (9, 9)):
         source = TerrainConfig(source="synthetic", rows=rows, cols=cols, relief_m=1.0)
         assert build_terrain(Scenario(terrain=source)).grid.cells == rows * cols
+
+
+def test_the_scenario_in_the_documentation_builds(tmp_path: Path) -> None:
+    import re
+
+    import rasterio.warp
+    import shapely
+    from pyogrio.raw import write
+    from rasterio.transform import from_origin
+
+    gis = Path(__file__).parents[3] / "docs" / "gis"
+    text = (gis / "terrain.md").read_text() + (gis / "vectors.md").read_text()
+    blocks = re.findall(r"^```toml\n(.*?)^```", text, re.MULTILINE | re.DOTALL)
+    (tmp_path / "mine.toml").write_text("".join(blocks[:4]))
+    # The north-east corner of its no-go area is then 900 m east and 100 m south of the north-west one of the map.
+    (x_m,), (y_m,) = rasterio.warp.transform("EPSG:4326", "EPSG:32632", [9.03], [46.93])
+    place = from_origin(x_m - 900, y_m + 100, 20, 20)
+    written(tmp_path / "dem.tif", np.random.default_rng(1).uniform(0, 2, (60, 70)), transform=place)
+    written(tmp_path / "photo.tif", np.full((3, 60, 70), 120), "uint8", transform=place)
+    roads = np.zeros((60, 70), np.uint8)
+    roads[30] = 1
+    written(tmp_path / "roads.png", roads, "uint8", driver="PNG", crs=None, transform=None)
+    # A river along the sixth column, from the sixth row to the 45th.
+    west_m, north_m = x_m - 900, y_m + 100
+    course = [(west_m + 110, north_m - 100), (west_m + 110, north_m - 900)]
+    river = shapely.to_wkb(np.array([shapely.LineString(course)]))
+    columns = {"field_data": [np.array(["river"])], "fields": ["waterway"], "geometry_type": "LineString"}
+    write(tmp_path / "extract.gpkg", geometry=river, layer="lines", crs="EPSG:32632", **columns)
+    terrain = build_terrain(load_scenario(tmp_path / "mine.toml"))
+    assert np.isinf(terrain.pace_s_per_m[5:45, 5]).all()
+    assert (terrain.pace_s_per_m[30, 45:] == np.float32(0.05)).all()
+    assert np.isinf(terrain.pace_s_per_m[20, 40])

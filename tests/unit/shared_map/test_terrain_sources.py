@@ -22,6 +22,8 @@ from swarm.config.ground import TerrainConfig
 from swarm.config.scenario import Scenario
 from swarm.errors import TerrainError
 
+DATA = Path(__file__).parents[4] / "shared" / "data"
+needs_data = pytest.mark.skipif(not DATA.is_dir(), reason="../shared/data is absent")
 UTM = from_origin(500_000, 5_200_000, 20, 20)
 
 
@@ -302,6 +304,25 @@ def test_a_raster_within_another_file_is_that_raster(tmp_path: Path) -> None:
 
 
 # --- real data ----------------------------------------------------------------------------------------------
+
+
+@needs_data
+def test_real_pairs_come_onto_one_grid() -> None:
+    davos = load(DATA / "dem/davosdorf/davosdorf.tif", photo=str(DATA / "dem/davosdorf/davosdorf_color.tif"))
+    assert (davos.grid.rows, davos.grid.cols, davos.grid.resolution_m) == (495, 559, 10)
+    assert davos.photo is not None
+    rmnp = load(DATA / "dem/rmnp/rmnp-dem.tif", photo=str(DATA / "dem/rmnp/rmnp-rgb.tif"))
+    assert 230 < rmnp.grid.resolution_m < 238
+    assert rmnp.photo.shape == (rmnp.grid.rows, rmnp.grid.cols, 3)
+    assert not np.isnan(rmnp.elevation_m).any()
+    tujunga = load(DATA / "dem/bigtujunga/bigtujunga_512.tif")
+    assert tujunga.elevation_m.shape == (512, 512)
+
+
+@needs_data
+def test_jacksboro_from_its_file_is_jacksboro() -> None:
+    file = load(DATA / "dem/jacksboro/jacksboro_fault_dem.npz", resolution_m=75.0)
+    np.testing.assert_array_equal(file.elevation_m, load("jacksboro").elevation_m)
 
 
 def test_the_built_in_terrain_lies_where_its_degrees_are() -> None:

@@ -34,7 +34,7 @@ from swarm.wire.messages.processes import Note, RunInfo
 from swarm.wire.messages.vehicles import Obstacle
 from swarm.wire.route_columns import Route as WireRoute
 from swarm.wire.route_columns import RouteStatus
-from swarm.wire.topics import FLEET, NOTE, OBSTACLE, RUN
+from swarm.wire.topics import FLEET, NOTE, OBSTACLE, POSE, RUN
 
 LETHAL, CLEAR, PACE = MarkKind.LETHAL, MarkKind.CLEAR, MarkKind.PACE
 NOWHERE = [(math.nan, 5.0), (5.0, math.inf), (-0.1, -5.0), (5.0, 0.1), (1e12, -5.0), (500.1, -5.0), (5.0, -400.1)]
@@ -478,6 +478,14 @@ def test_an_observer_sees_the_vehicles_of_an_agent_until_it_is_silent(world: Swa
     assert watching.vehicles == {}
 
 
+@pytest.mark.parametrize(("targets", "given"), [(None, ([], True)), ([], ([], False)), (["t"], (["t"], False))])
+def test_a_group_chases_what_it_is_told_or_again_what_the_scenario_says(world, monkeypatch, targets, given):
+    orders, told = Program(world).swarm.orders(), []
+    monkeypatch.setattr(orders, "_give", lambda **order: told.append((order["targets"], order["off"])))
+    orders.chase("red", targets)
+    assert told == [given]
+
+
 def test_a_link_that_comes_back_says_everything_again_at_once(world: Swarm) -> None:
     obstacles, program = Obstacles(world), Program(world)
     rover = program.swarm.vehicle("rover", lease_s=10.0)
@@ -606,3 +614,11 @@ def test_a_stream_is_read_by_a_thread_and_ends_when_closed() -> None:
     for n in range(5):
         bounded.put(n)
     assert (bounded.next(0), bounded.next(0), bounded.next(0)) == (3, 4, None)
+
+
+def test_poses_of_a_target_go_out_twice_a_second(world: Swarm) -> None:
+    heard: list[Any] = []
+    world.bus("ear2").subscribe(POSE, heard.append, target="x")
+    Program(world).swarm.target("x").at(5.0, -5.0)
+    world.run(3.0)
+    assert 7 <= len(heard) <= 8

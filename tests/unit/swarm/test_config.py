@@ -2,12 +2,15 @@
 
 import re
 from pathlib import Path
+from typing import get_args, get_type_hints
 
 import pytest
 
 from swarm.config.agent_plan import crew_of, plan_agents
+from swarm.config.explain import meanings
 from swarm.config.load import load_scenario, parse_scenario, read_scenario
 from swarm.config.scenario import Scenario
+from swarm.config.setting_types import Section
 from swarm.errors import ConfigError
 
 
@@ -98,6 +101,51 @@ def test_agents_take_so_many_vehicles_each_and_one_group():
     ids = [id for agent in agents for id in agent.vehicle_ids]
     assert len(set(ids)) == scenario.vehicle_count
     assert ids[4] == "a1-00"
+
+
+def test_a_scenario_comes_through_a_file_unchanged():
+    scenario = parse_scenario("[[targets]]\nname = 'x'\ncount = 2\nstart = [3, 4]\nspeed_m_per_s = 2")
+    assert scenario.targets[0].start == (3, 4)
+    assert scenario.targets[0].speed_m_per_s == 2.0
+    assert scenario.target_ids == ["x0", "x1"]
+
+
+def sections_of(kind: type) -> set[type[Section]]:
+    """A section and all sections that its fields reach; other modules have sections of files of their own."""
+    found: set[type[Section]] = set()
+    waiting = [kind]
+    while waiting:
+        kind = waiting.pop()
+        if isinstance(kind, type) and issubclass(kind, Section):
+            if kind not in found:
+                found.add(kind)
+                waiting += get_type_hints(kind).values()
+        else:
+            waiting += get_args(kind)
+    return found
+
+
+@pytest.mark.parametrize("section", sorted(sections_of(Scenario), key=str), ids=lambda section: section.__name__)
+def test_every_setting_has_its_row_and_every_row_its_setting(section):
+    assert list(meanings(section)) == list(section.__struct_encode_fields__)
+    assert all(meaning.strip() for meaning in meanings(section).values())
+
+
+def test_a_row_goes_on_in_the_lines_below_it_and_ends_before_the_next_sentence():
+    class Tank(Section, frozen=True):
+        """A tank.
+
+        size_l  how much it holds,
+                in litres
+        full    whether it is
+
+        A sentence with  two blanks.
+        """
+
+        size_l: float = 1.0
+        full: bool = False
+
+    assert meanings(Tank) == {"size_l": "how much it holds, in litres", "full": "whether it is"}
 
 
 def test_no_pattern_of_a_setting_lets_a_line_end_through() -> None:

@@ -25,6 +25,13 @@ def pattern(monkeypatch: pytest.MonkeyPatch) -> Pattern:
     return pattern
 
 
+def test_the_ids_of_the_largest_simulated_swarm_are_matched_once_each(pattern: Pattern) -> None:
+    for _ in range(3):
+        for n in range(10_000):
+            fields.check_id("vehicle", f"v{n}")
+    assert pattern.matched == 10_000
+
+
 def test_a_sender_of_ever_new_ids_makes_no_process_know_more_than_there_is_room_for(pattern, monkeypatch):
     monkeypatch.setattr(fields, "_MAX_KNOWN_IDS", 10)
     for n in range(100):

@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import pytest
 from support.bus_behaviour import *  # noqa: F403
-from support.bus_world import Box, answering, asked, pose
+from support.bus_world import Box, answering, asked, note, pose
 from support.makers import run_info
 from support.query_behaviour import *  # noqa: F403
 from support.swarm_model import START_NS, LossyLinks, SwarmModel
@@ -16,8 +16,8 @@ from swarm.bus.scheduler import InlineWorker, Scheduler
 from swarm.clock import ManualClock
 from swarm.peers import Peer
 from swarm.wire.codec import decode
-from swarm.wire.messages import Nothing
-from swarm.wire.topics import POSE, RUN
+from swarm.wire.messages import Nothing, schema_of
+from swarm.wire.topics import NOTE, POSE, RUN
 
 
 @pytest.fixture
@@ -89,6 +89,16 @@ def test_replies_keep_their_order_though_the_link_does_not():
     assert [type(event) for event in box] == [Replied, AskEnded]
 
 
+def test_those_who_hear_a_message_share_it():
+    world = SwarmModel()
+    a, boxes = world.bus("a"), [Box() for _ in range(3)]
+    for n, box in enumerate(boxes):
+        world.bus(f"b{n}").subscribe(NOTE, box)
+    a.publish(NOTE, note("x"), role="agent", id="a0")
+    world.settle()
+    assert boxes[0][0] is boxes[1][0] is boxes[2][0]
+
+
 def test_a_closed_node_gets_nothing_that_was_under_way():
     world, box = SwarmModel(), Box()
     a, b = world.bus("a"), world.bus("b")
@@ -114,6 +124,17 @@ def test_a_node_that_dies_while_cut_off_stays_gone():
     world.heal(a)
     world.settle()
     assert box[1:] == [Disappeared(Peer("agent", "a", 1))]
+
+
+def test_every_delivery_is_traced():
+    world = SwarmModel()
+    a, b = world.bus("a"), world.bus("b")
+    b.subscribe(POSE, Box())
+    a.publish(POSE, pose(), target="t0")
+    world.settle()
+    ((now_ns, source, destination, what, payload),) = world.deliveries
+    assert (now_ns, source, destination, what) == (START_NS + 200_000, "a", "b", "pose")
+    assert schema_of("pose").encode() in payload
 
 
 def test_a_put_is_decoded_once_however_many_hear_it(monkeypatch):

@@ -8,6 +8,16 @@ from hypothesis import strategies as st
 from swarm.peers import SILENCE_NS, Leases, Newest, Peer, Roster
 
 
+def test_a_new_incarnation_may_appear_before_the_old_one_is_gone():
+    roster = Roster()
+    roster.appeared(Peer("planner", "t0", 1))
+    roster.appeared(Peer("planner", "t0", 2))
+    roster.gone(Peer("planner", "t0", 1))
+    assert roster.alive("planner") == {"t0": 2}
+    roster.gone(Peer("planner", "t0", 2))
+    assert not roster.is_alive("planner", "t0")
+
+
 def test_however_many_tokens_one_process_raises_only_its_newest_are_kept() -> None:
     roster = Roster()
     for incarnation in range(1000, 0, -1):
