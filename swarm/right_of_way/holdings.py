@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence, Set
 from dataclasses import dataclass, field
 from functools import lru_cache
 from hashlib import blake2b
@@ -57,6 +57,10 @@ class Tell:
     standing: HostState
 
 
+_Told = tuple[Stand, object]
+"""A stand, and what of it is news."""
+
+
 @dataclass(slots=True)
 class _View:
     """State of one shard as a host knows it.
@@ -72,7 +76,8 @@ class _View:
     words     member -> (epoch, digest) of its last word, where names are proven; a grant is its leader's word. An
               older one that comes late does no harm: no entry is taken that a used table could have granted
     pending   leader -> its last grant, until a majority has the same on file, and its digest
-    told      the last statement about our vehicles, and its time
+    stands    vehicle that has a place -> the last statement about it
+    told      what was news of the last statement about our vehicles, and its time
     same      whether the next statement is known to be the same
     """
 
@@ -88,22 +93,19 @@ class _View:
     quiet: int | None = None
     words: dict[str, tuple[int, int]] = field(default_factory=dict)
     pending: dict[str, tuple[Granted, int]] = field(default_factory=dict)
+    stands: dict[str, _Told] = field(default_factory=dict)
     told: object = None
     told_ns: int = 0
     same: bool = False
 
 
-_Told = tuple[Stand, object]
-"""A stand, and what of it is news."""
-
-
 class _Said(msgspec.Struct, frozen=True):
-    """Statement about one vehicle while nothing about it changes: a stand per shard."""
+    """Statement about one vehicle, and the shards to which it was made."""
 
     wish: Wish
     path: list[int]
     held: list[Number]
-    stands: dict[int, _Told]
+    shards: Set[int]
 
 
 class Holdings:
@@ -238,7 +240,8 @@ class Holdings:
         self._entries.leave(vehicle)
         self._paths.pop(vehicle, None)
         said = self._said.pop(vehicle, None)
-        for shard in () if said is None else said.stands:
+        for shard in () if said is None else said.shards:
+            del self._views[shard].stands[vehicle]
             self._views[shard].same = False
 
     @property
@@ -344,7 +347,9 @@ class Holdings:
         for vehicle in changed & self._paths.keys():
             self._set_path(vehicle)
         self._followed = {number for view in self._views.values() for number in chain(*view.followed.values())}
-        for vehicle in view.seen.keys() & self._paths.keys() if granted.followed else ():
+        cells = {number[0] for number in self._followed if granted.followed}
+        here = view.seen.keys() & self._paths.keys()
+        for vehicle in [id for id in here if not cells.isdisjoint(self._paths[id])]:
             far = [entry.number for entry in self._entries.paths[vehicle][self.keeps + 1 :]]
             if not self._followed.isdisjoint(far):
                 self.give_back(vehicle, self.keeps + 1 + [number in self._followed for number in far].index(True))
@@ -374,10 +379,9 @@ class Holdings:
         if not self.generation:
             return []
         self._seq += 1
-        by_shard: dict[int, dict[str, _Told]] = {shard: {} for shard in self.watched}
-        for vehicle, stands in self._say_changed(wishes):
-            for shard, told in stands.items():
-                by_shard.setdefault(shard, {})[vehicle] = told
+        self._say_changed(wishes)
+        concerned = {**self.watched, **{shard: None for shard, view in self._views.items() if view.stands}}
+        by_shard = {shard: {**self._views[shard].stands} for shard in concerned}
         entries = self._entries
         for vehicle, cell in entries.bodies.items():
             if vehicle not in entries.paths:
@@ -417,9 +421,9 @@ class Holdings:
                     words.setdefault(host, []).extend(left)
         return [Left(agent=self.name, host=host, entries=numbers) for host, numbers in words.items()]
 
-    def _say_changed(self, wishes: Mapping[str, Wish]) -> Iterator[tuple[str, Mapping[int, _Told]]]:
-        """Yields the statements about each vehicle that has a place. Those of a vehicle are made again if its path,
-        wish or granted cells have changed."""
+    def _say_changed(self, wishes: Mapping[str, Wish]) -> None:
+        """Makes the statements about vehicles that have a place again where their path, wish or granted cells have
+        changed."""
         anew, self._seen_anew = self._seen_anew, set()
         for vehicle, path in self._paths.items():
             before, wish = self._said.get(vehicle), wishes.get(vehicle, _NO_WISH)
@@ -430,11 +434,11 @@ class Holdings:
                 or vehicle in anew
             ):
                 said = self._said[vehicle] = self._say(vehicle, path, wish)
-                for shard in said.stands:
-                    self._views.setdefault(shard, _View()).same = False
-                if before is None or before.stands.keys() != said.stands.keys():
+                before_at = set[int]() if before is None else before.shards
+                if before_at != said.shards:
                     self._say_all_again()
-            yield vehicle, self._said[vehicle].stands
+                for shard in before_at - said.shards:
+                    del self._views[shard].stands[vehicle]
 
     def _is_no_news(self, said: _Said, path: list[int]) -> bool:
         """Returns True if a vehicle has only driven on, out of cells for which none waits, and has as many ahead as
@@ -484,21 +488,23 @@ class Holdings:
         return True
 
     def _say(self, vehicle: str, path: list[int], wish: Wish) -> _Said:
+        """States a vehicle to each shard that it is near."""
         ahead, wants, better = [*wish.ahead], list[int](), 0
         if len(path) == 1:
             wants, better = [*wish.wants], wish.better
         shard_of = self._shard_of
         concerned = [*path, *ahead[:1], *wants]
-        near: Collection[int] = {*map(shard_of, concerned)}
+        near: Set[int] = {*map(shard_of, concerned)}
         if len(near) > 1:
-            near = dict.fromkeys(shard for shard in map(shard_of, concerned) if shard >= 0)
-        stands: dict[int, _Told] = {}
+            near = dict.fromkeys(shard for shard in map(shard_of, concerned) if shard >= 0).keys()
         held = [entry.number for entry in self._entries.paths[vehicle]]
         for shard in near:
-            holds = Held.of([number for number in held if len(near) == 1 or shard_of(number[0]) == shard])
+            holds = Held.of(held if len(near) == 1 else [each for each in held if shard_of(each[0]) == shard])
             stand = Stand(vehicle, path[0], path[-1], holds, ahead, wants, better, wish.age_ms, self.keeps)
-            stands[shard] = stand, (vehicle, path[0], holds, ahead, better)
-        return _Said(wish, path, held, stands)
+            view = self._views.setdefault(shard, _View())
+            view.same = False
+            view.stands[vehicle] = stand, (vehicle, path[0], holds, ahead, better)
+        return _Said(wish, path, held, near)
 
     def _forget_left(self, by_shard: Mapping[int, Mapping[str, _Told]]) -> None:
         """Leaves the shards where we hold and want nothing, once their tables show that they know it."""

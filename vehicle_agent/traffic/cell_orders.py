@@ -6,7 +6,7 @@ word of their own host, or by proof that its generation has ended.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import lru_cache
 
 from swarm.config.agent_plan import agent_of
@@ -99,10 +99,9 @@ class Orders:
         """The number of entries of a host."""
         return sum(len(self.of[vehicle]) for vehicle in self.by_host.get(host, ()))
 
-    def has(self, cell: int, vehicles: Collection[str]) -> bool:
-        """Returns True if one of these vehicles has an entry of a cell, by its host's newest generation."""
-        order = self.order(cell).items()
-        return any(vehicle in vehicles and number not in self._fences for number, vehicle in order)
+    def cells_of(self, host: str) -> set[int]:
+        """The cells of which vehicles of a host have an entry, by its newest generation."""
+        return {number[0] for vehicle in self.by_host.get(host, ()) for number in self.of[vehicle]}
 
     def is_fenced(self, cell: int) -> bool:
         """Returns True if an earlier generation of a host may be on a cell, or enter it."""
@@ -118,7 +117,7 @@ class Orders:
 
     def waits(self, vehicle: str) -> bool:
         """Returns True if the last entry of a vehicle waits for another."""
-        return any(True for number in self.entries(vehicle)[-1:] for _ in self.before(number, vehicle))
+        return any(self._before(number, vehicle) for number in self.entries(vehicle)[-1:])
 
     def is_followed(self, cell: int, vehicle: str) -> bool:
         """Returns True if others wait for a cell until this vehicle leaves it."""
@@ -264,7 +263,7 @@ class Orders:
         for vehicle in list(self.by_host.get(host, ())):
             if vehicle in holds and holds[vehicle] == self._held.get(vehicle):
                 continue  # it holds all, as most do: that is known without comparing each entry
-            held, entries = [*holds.get(vehicle, ())], self.of[vehicle]
+            held, entries = {*holds.get(vehicle, ())}, self.of[vehicle]
             kept = [entry for entry in entries if entry in held or entry[1:] > knows]
             if len(kept) < len(entries):
                 for entry in entries:

@@ -14,8 +14,6 @@ from functools import lru_cache
 from itertools import chain
 from zlib import crc32
 
-from msgspec.structs import replace
-
 from swarm.clock import NS_PER_S
 from swarm.config.agent_plan import agent_of
 from swarm.right_of_way.generations import HEARTBEAT_NS, is_far_ahead, is_said
@@ -79,11 +77,6 @@ def _lot(vehicle: str, step: int) -> int:
     return crc32(f"{vehicle}/{step}".encode())
 
 
-def _rests(stand: Stand, entries: Sequence[Number]) -> bool:
-    """Returns True if a vehicle has no entry but that of its cell."""
-    return stand.cell == stand.end and (not entries or (len(entries) == 1 and entries[0][0] == stand.cell))
-
-
 @dataclass(slots=True)
 class _Host:
     """Known state of a host.
@@ -138,7 +131,7 @@ class Leader:
         self._changed = False  # or anything else
         self._told: Table | None = None
         self._told_ns = 0
-        self._content: dict[Stamp, dict[str, tuple[Granted, Granted]]] = {}
+        self._content: dict[Stamp, dict[str, tuple[Granted, object]]] = {}
         """Stamp of a table -> as `_content_of` it."""
         self._said_of: Stamp | None = None
         self._said_ns = 0
@@ -250,11 +243,11 @@ class Leader:
                 host.told, host.told_ns = news, now_ns
                 yield granted
 
-    def _content_of(self, table: Table) -> dict[str, tuple[Granted, Granted]]:
-        """Returns host -> its part of the table that has just been made, and the same without what is no news: the
-        number of the table and, while the host has vehicles, which statement of it was heard."""
+    def _content_of(self, table: Table) -> dict[str, tuple[Granted, object]]:
+        """Returns host -> its part of the table that has just been made, and what of that is news: not the number
+        of the table nor, while the host has vehicles, which statement of it was heard."""
         orders, cols, followed = self._orders, self._shards.grid.cols, self._orders.followed()
-        found: dict[str, tuple[Granted, Granted]] = {}
+        found: dict[str, tuple[Granted, object]] = {}
         for name, host in self._hosts.items():
             grants, waits = orders.granted(name)
             # Also around those under way: their requests once they come to rest depend on the cells around.
@@ -273,9 +266,10 @@ class Leader:
                 waits=waits,
                 followed=followed.get(name, {}),
                 pushed={vehicle: age for vehicle, age in table.pushed.items() if vehicle in grants},
-                occupied=sorted(cell for cell in near & orders.orders.keys() if not orders.has(cell, grants)),
+                occupied=sorted((near & orders.orders.keys()).difference(orders.cells_of(name))),
             )
-            found[name] = granted, replace(granted, epoch=0, seq=0, heard=0 if stands else heard)
+            news = grants, waits, granted.followed, granted.pushed, granted.occupied
+            found[name] = granted, (generation, 0 if stands else heard, news)
         return found
 
     def _plan(self, now_ns: int) -> None:
@@ -287,16 +281,16 @@ class Leader:
         # The vehicle that has been on its way for longest goes first.
         asking = sorted(chain.from_iterable([host.asking for host in hosts]), key=_turn)
         movers: dict[str, Mover] = {}
-        for stand in asking:
+        for stand in [each for each in asking if each.cell == each.end]:
             entries = self._orders.entries(stand.vehicle)
             if not entries and is_entering(stand):
                 continue  # no vehicle makes way for it
-            if _rests(stand, entries):
+            if not entries or (len(entries) == 1 and entries[0][0] == stand.cell):
                 outside = not entries or stand.cell in stand.wants  # it waits to come to its first cell
                 movers[stand.vehicle] = Mover(
                     stand.vehicle, stand.cell, stand.wants, stand.better, stand.age_ms, outside=outside
                 )
-        self._stands = {id: stand for host in hosts for id, stand in host.stands.items()}
+        self._stands = dict(chain.from_iterable(host.stands.items() for host in hosts))
         round = Round(
             list(movers.values()),
             lambda cell: self._stays(cell, movers),
@@ -307,15 +301,15 @@ class Leader:
             mover = movers.get(stand.vehicle)
             if mover is not None:
                 round.plan(mover, pushed=self._orders.is_followed(mover.cell, mover.id))
-            elif stand.ahead and not self._orders.waits(stand.vehicle):
-                self._grant(stand, self._next_ahead(stand), round.taken)
+            elif (ahead := self._next_ahead(stand)) and not self._orders.waits(stand.vehicle):
+                self._grant(stand, ahead, round.taken)
         # Who makes way first, so that others may follow it.
         standing = {mover.cell: id for id, mover in movers.items() if not mover.outside}
         granted: set[str] = set()
-        for stand in asking:
+        for stand in [each for each in asking if each.vehicle in round.to]:
             chain_of = [stand.vehicle]
-            while (ahead := standing.get(round.to.get(chain_of[-1], -1))) is not None and ahead not in chain_of:
-                chain_of.append(ahead)
+            while (next := standing.get(round.to.get(chain_of[-1], -1))) is not None and next not in chain_of:
+                chain_of.append(next)
             for vehicle in reversed(chain_of):
                 to = round.to.get(vehicle)
                 if to is not None and vehicle not in granted:
@@ -354,11 +348,10 @@ class Leader:
 
     def _next_ahead(self, stand: Stand) -> Sequence[int]:
         """The cells ahead of one that is under way, from where all that it has been granted ends."""
-        cells = [number[0] for number in self._orders.entries(stand.vehicle)]
-        if not cells or cells[-1] == stand.end or stand.end not in cells:
-            return stand.ahead if not cells or stand.end in cells else []
-        last = cells[-1]
-        return stand.ahead[stand.ahead.index(last) + 1 :] if last in stand.ahead else []
+        cells = [number[0] for number in self._orders.entries(stand.vehicle)] or [stand.end]
+        ahead = [stand.end, *stand.ahead]
+        follows = stand.end in cells and cells[-1] in ahead
+        return ahead[ahead.index(cells[-1]) + 1 :] if follows else []
 
     def _grant(self, stand: Stand, ahead: Sequence[int], taken: dict[int, str]) -> None:
         """Append entries up to the first that is not possible, or that waits: none goes behind that. Further than
@@ -385,8 +378,8 @@ class Leader:
     def _is_near(self, cell: int, vehicle: str) -> bool:
         """Returns True if another vehicle has an entry of a cell, or of one beside it."""
         held = self._orders.orders
-        near = (held[each] for each in (cell, *cells_beside(cell, self._shards.grid.cols)) if each in held)
-        return any(other != vehicle for order in near for other in order.values())
+        near = held.keys() & cells_beside(cell, self._shards.grid.cols)
+        return any(other != vehicle for each in (cell, *near) for other in self._orders.order(each).values())
 
     def _may_follow(self, stand: Stand, order: Mapping[Number, str]) -> bool:
         """Returns True if a vehicle may be put behind those in an order."""
