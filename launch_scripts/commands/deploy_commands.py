@@ -14,7 +14,6 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from launch_scripts.check.scenario_check import check_start
 from launch_scripts.commands.shared_options import AsJson, Force, Namespace, ScenarioArgument, Tls
 from launch_scripts.deploy import certificates, machines_needed
 from launch_scripts.deploy.hosts import load_hosts
@@ -74,6 +73,8 @@ def plan(
     wheel  Put this wheel of the swarm into the archives, to be installed from them.
     days   Days until new certificates expire.
     """
+    from launch_scripts.check.scenario_check import check_start  # `revoke` does not wait for it
+
     chosen = with_network(find_scenario(scenario), namespace=namespace)
     try:
         run_id = common_run_id(chosen)

@@ -29,6 +29,7 @@ def of_file(name: str, settings: Mapping[str, Any] | None = None) -> Scenario:
 
 
 SMALL = of_file("small")
+WIDE = of_file("wide")
 ROVERS = "rovers"
 """A crowd with 20 rovers that avoid no vehicle."""
 MIXED = ("small", "wide", *CROWDS)

@@ -99,7 +99,7 @@ def test_each_law_has_its_sentence():
     book = LawBook(simulation)
     simulation.run_until(3)
     book._unmoved |= {f"w{cell}": cell for cell in range(simulation.terrain.grid.cells)}
-    book._truths = {"ground": np.full(simulation.terrain.grid.cells, np.inf, np.float32)}
+    book._grounds["ground"].pace_s_per_m = np.full(simulation.terrain.grid.cells, np.inf, np.float32)
     book.acknowledged["nobody.a9.1", 0] = (1, 1)
     book.longest_s, book.longest = 11.0, (12.0, "v", 5)
     broken = {law.law: law for law in book.run(10)}
