@@ -18,7 +18,7 @@ from swarm.config.explain import choice
 from swarm.config.vehicle_classes import GROUND, class_numbers, first_classes
 from swarm.peers import job_of
 from swarm.runtime.election import Candidacy
-from swarm.runtime.membership import Member
+from swarm.runtime.membership import Member, MemberService
 from swarm.runtime.order_client import OrderClient
 from swarm.runtime.role_setup import RoleSetup
 from swarm.wire.messages.orders import Obey
@@ -37,7 +37,7 @@ class Planning:
     worker: Worker
 
 
-class PlanningProcess:
+class PlanningProcess(MemberService):
     """One of several processes with the same job; their leader serves.
 
     groups         those whose marks it may know; None if all
@@ -61,7 +61,6 @@ class PlanningProcess:
         self._first_classes = first_classes(scenario)
         self._member = Member(setup.info(terrain.grid, terrain.digest), bus, post, setup.before)
         self._candidacy = Candidacy(setup, scenario.standbys.planner, scenario.planner.tick_hz, bus, post)
-        self.counters = self._member.counters
         cost_map = CostMap(terrain, learning=scenario.map.learning)
         self._mark_filter = MarkFilter(terrain.grid, groups)
         self._maps = ClassMaps(cost_map, class_terrains(scenario, terrain), class_numbers(scenario))
@@ -87,9 +86,6 @@ class PlanningProcess:
         if name not in self._cost_maps:
             return f"there is no class {name!r}{choice(name, [*self._cost_maps], ' there are ')}"
         return None if self._has_kernels(name) else f"the kernels for class {name} are still being compiled"
-
-    def lacks(self) -> list[str]:
-        return self._member.lacks()
 
     def start(self, now_ns: int) -> None:
         self._member.join()

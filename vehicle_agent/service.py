@@ -19,6 +19,7 @@ from swarm.bus.bus import Appeared, Asked, AskEnded, Bus, Disappeared, Event, He
 from swarm.clock import NS_PER_S
 from swarm.config.agent_plan import place_job
 from swarm.peers import Roster, job_of
+from swarm.runtime.membership import MemberService
 from swarm.runtime.order_client import OrderClient
 from swarm.runtime.role_setup import RoleSetup
 from swarm.runtime.stats import GAPS_OF, GAPS_TO, UNPROVEN_OF, UNPROVEN_TO
@@ -58,7 +59,7 @@ _COUNTED_FROM_0 = ("reroute_requests", "routes_received", "marks", "blocked_tick
 M = TypeVar("M", bound=Message)
 
 
-class AgentService:
+class AgentService(MemberService):
     """Drives the vehicles of one agent, marks what they find, and publishes where they are.
 
     agent      the core
@@ -82,7 +83,6 @@ class AgentService:
         self.agent, self._member, self._replica, self._sync = parts.agent, parts.member, parts.replica, parts.sync
         self._maps, self._right_of_way, self._detector = parts.maps, parts.right_of_way, parts.detector
         self._author, self._class = parts.author, self.agent.plan.group.vehicle_class
-        self.counters = self._member.counters
         for name in _COUNTED_FROM_0:
             self.counters.count(name, 0)
         self._order_client = OrderClient(setup, bus, post, self._obeys, self.agent.goals.book)
@@ -119,9 +119,6 @@ class AgentService:
             return host.informed
         absent = set(self.agent.plan.vehicle_ids).difference(self.agent.vehicles, self._removed)
         return not absent or host.have_left(absent)
-
-    def lacks(self) -> list[str]:
-        return self._member.lacks()
 
     def start(self, now_ns: int) -> None:
         bus, post, id = self._bus, self._post, self._setup.id

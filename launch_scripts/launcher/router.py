@@ -27,11 +27,10 @@ from swarm.config.scenario import NetworkConfig
 from swarm.errors import BusError, SwarmError
 from swarm.peers import Peer
 from swarm.runtime.inbox import Inbox
-from swarm.runtime.membership import NO_RUN, Member
+from swarm.runtime.membership import NO_RUN, Member, MemberService
 from swarm.runtime.process import Process
 from swarm.runtime.role_setup import RoleSetup
 from swarm.runtime.run_secret import authenticator_of
-from swarm.runtime.stats import Counters
 from swarm.wire.messages import WIRE_VERSION
 from swarm.wire.messages.processes import RunInfo
 
@@ -42,7 +41,7 @@ _OPEN_WITHIN_S = 5.0
 taken for longer belongs to another program."""
 
 
-class RouterService:
+class RouterService(MemberService):
     """Belongs to no run, so it may be stopped, started again and replaced while runs go on around it.
 
     reopened  asked at each tick: the bus in place of the one before, which is closed; None: it stays
@@ -65,13 +64,6 @@ class RouterService:
         )  # fmt: skip
         self._member = Member(info, bus, post)
         self._reopened = reopened
-
-    @property
-    def counters(self) -> Counters:
-        return self._member.counters
-
-    def lacks(self) -> list[str]:
-        return self._member.lacks()
 
     def start(self, now_ns: int) -> None:
         self._member.join()

@@ -36,9 +36,9 @@ from swarm.clock import NS_PER_S
 from swarm.config.ground import HiddenConfig
 from swarm.config.vehicle_classes import aloft_classes
 from swarm.peers import Peer
-from swarm.runtime.membership import Member
+from swarm.runtime.membership import Member, MemberService
 from swarm.runtime.role_setup import RoleSetup
-from swarm.runtime.stats import VIEWERS, Counters
+from swarm.runtime.stats import VIEWERS
 from swarm.wire.messages.planning import CostReply, PlannerStatus
 from swarm.wire.messages.processes import Note, Stats
 from swarm.wire.messages.vehicles import Fleet
@@ -62,7 +62,7 @@ _ANSWER_S = 5.0
 for a busy machine."""
 
 
-class MonitorService:
+class MonitorService(MemberService):
     """Shows a run on a recording stream.
 
     scene      terrain and other inputs that are known beforehand
@@ -93,7 +93,6 @@ class MonitorService:
         self._recording, self._audience = recording, audience
         self._member = Member(setup.info(terrain.grid, terrain.digest), bus, post, setup.before)
         self._member.web_port = web_port
-        self.counters: Counters = self._member.counters
         cost_map = CostMap(terrain, learning=scenario.map.learning)
         replica = MapReplica(terrain.grid, cost_map)
         self._sync = MapSync(replica, bus, post, scenario.map, setup.role, at_ticks=True)
@@ -110,9 +109,6 @@ class MonitorService:
         self._newest_stamp_ns = setup.started_ns
         self._started_ns = 0
         self._member.needs("the shared map", lambda: self._sync.joined)
-
-    def lacks(self) -> list[str]:
-        return self._member.lacks()
 
     def start(self, now_ns: int) -> None:
         self._started_ns = now_ns

@@ -25,7 +25,7 @@ from swarm.clock import NS_PER_S
 from swarm.config.vehicle_classes import class_numbers
 from swarm.errors import StoreError
 from swarm.peers import Roster
-from swarm.runtime.membership import Member
+from swarm.runtime.membership import Member, MemberService
 from swarm.runtime.role_setup import RoleSetup
 from swarm.runtime.stats import figures
 from swarm.wire.messages.map_data import MarkSet
@@ -56,12 +56,11 @@ _MOST_PROCESSES = 4096
 """Number of remembered `Stats`: the holder of a certificate may write under any number of ids."""
 
 
-class KeeperService:
+class KeeperService(MemberService):
     """A replica which writes every set to its store, publishes by its digest which sets are safe there, and replies
     for all authors, above all for dead ones.
 
     replica   the marks
-    counters  what the process publishes of itself
     modules   returns True if the modules which draw zones are loaded; its first call starts loading them. None:
               they are loaded
     """
@@ -79,7 +78,6 @@ class KeeperService:
         self._zones_held: list[tuple[Asked, ZoneOrder]] = []
         """Orders of zones that wait until they can be drawn."""
         self._member = Member(setup.info(terrain.grid, terrain.digest), bus, post, setup.before)
-        self.counters = self._member.counters
         self._bus = bus
         self._post = post
         self._id = setup.id
@@ -125,9 +123,6 @@ class KeeperService:
         store.bind(terrain.digest, terrain.grid, list(self._numbers))
         for each in self.replica.merge(list(store.load()), measured=False).sets:
             self._keeper.restored(each)
-
-    def lacks(self) -> list[str]:
-        return self._member.lacks()
 
     def start(self, now_ns: int) -> None:
         self._member.join()

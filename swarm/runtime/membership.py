@@ -311,6 +311,19 @@ class Member:
         self._bus.ask(RUN, Nothing(), self._post, tag=_TAG, timeout_s=2.0)
 
 
+class MemberService:
+    """Base of services that take part in a run: what they count and what they lack, their member says."""
+
+    _member: Member
+
+    @property
+    def counters(self) -> Counters:
+        return self._member.counters
+
+    def lacks(self) -> list[str]:
+        return self._member.lacks()
+
+
 def check_belongs(mine: RunInfo, others: Iterable[RunInfo]) -> None:
     """Raises RunMismatchError, in words, where others answer and none belongs to the same run."""
     differs: RunMismatchError | None = None

@@ -15,7 +15,7 @@ from swarm.bus.bus import Appeared, Bus, Disappeared, Event, Heard, Post, Replie
 from swarm.clock import NS_PER_S
 from swarm.peers import HIGHEST_RANK, Roster, job_of, ranked_id
 from swarm.runtime.election import Candidacy
-from swarm.runtime.membership import Member
+from swarm.runtime.membership import Member, MemberService
 from swarm.runtime.order_client import OrderClient
 from swarm.runtime.role_setup import RoleSetup
 from swarm.runtime.stats import CAPTURES_BY, CAPTURES_OF
@@ -66,7 +66,7 @@ no lost target."""
 _ASK = "where"
 
 
-class TargetsService:
+class TargetsService(MemberService):
     """The bus side of `TargetWorld`. Counts `captures, collisions, lethal_entries, poses`; `driven_into`, obstacles
     that vehicles drove into, and `hit_by_obstacles`, the other way round."""
 
@@ -96,12 +96,8 @@ class TargetsService:
         self._planners = Roster()
         self._member.needs("the orders of this run", lambda: self._order_client.known)
         self._member.needs("places of its targets", lambda: self._world.ready)
-        self.counters = self._member.counters
         for name in ("captures", *ALARMS, "poses"):
             self.counters.count(name, 0)
-
-    def lacks(self) -> list[str]:
-        return self._member.lacks()
 
     def start(self, now_ns: int) -> None:
         self._member.join()
