@@ -390,7 +390,7 @@ def write_reach(found: Reach, path: Path, every_s: float | None, slack: float) -
     """
     if path.suffix.lower() in (".tif", ".tiff"):
         seconds = np.where(np.isfinite(found.seconds), found.seconds, np.float32(-1))
-        told, tags = ["seconds of travel, -1 no way"], {"TIFFTAG_IMAGEDESCRIPTION": COSTS}
+        told, tags = ["seconds of travel, -1 no way"], {"TIFFTAG_IMAGEDESCRIPTION": f"{COSTS} {found.rule}"}
         write_raster(path, [seconds], found.grid, descriptions=told, unit="s", tags=tags, nodata=-1.0)
         return
     if every_s is None:
