@@ -21,12 +21,14 @@ from launch_scripts.launcher.run_options import find_scenario
 from launch_scripts.report.gis_formats import AREAS, TIFF, check_target, write_raster
 from launch_scripts.typer_commands import command, family_app
 from shared_map.terrain.pace_layers import TerrainClass
+from shared_map.terrain.slope_rules import said_of_cost
 from shared_map.terrain.terrain import Terrain, build_terrain
 from shared_map.terrain.terrain_report import facts_of, lines_of, notes_and_doubts
 from swarm.config.cost_rules import cost_of_preset
 from swarm.config.ground import TerrainConfig
 from swarm.config.scenario import Scenario
 from swarm.config.setting_types import ElevationEncoding
+from swarm.config.vehicle_classes import of_class
 from swarm.errors import ConfigError
 from swarm.grid import GridSpec
 
@@ -153,7 +155,8 @@ def cost(
         if out is not None:
             pace = np.where(np.isfinite(terrain.pace_s_per_m), terrain.pace_s_per_m, np.float32(-1))
             bands = ["pace, seconds per metre; -1 lethal"]
-            write_raster(out, [pace], terrain.grid, descriptions=bands, unit="s/m", nodata=-1.0)
+            about = {"TIFFTAG_IMAGEDESCRIPTION": said_of_cost(of_class(loaded, vehicle_class).cost)}
+            write_raster(out, [pace], terrain.grid, descriptions=bands, unit="s/m", tags=about, nodata=-1.0)
             tell("writing", 1.0)
     name = loaded.name if loaded.name != "unnamed" else Path(loaded.terrain.source).stem
     _draw(terrain, picture, name)

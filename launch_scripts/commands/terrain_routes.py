@@ -383,7 +383,8 @@ def write_reach(found: Reach, path: Path, every_s: float | None, slack: float) -
     """
     if path.suffix.lower() in (".tif", ".tiff"):
         seconds = np.where(np.isfinite(found.seconds), found.seconds, np.float32(-1))
-        told, tags = ["seconds of travel, -1 no way"], {"TIFFTAG_IMAGEDESCRIPTION": gis_formats.COSTS}
+        description = f"{gis_formats.COSTS} {found.rule}"
+        told, tags = ["seconds of travel, -1 no way"], {"TIFFTAG_IMAGEDESCRIPTION": description}
         gis_formats.write_raster(path, [seconds], found.grid, descriptions=told, unit="s", tags=tags, nodata=-1.0)
         return
     if every_s is None:

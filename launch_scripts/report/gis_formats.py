@@ -21,6 +21,7 @@ import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import lru_cache
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -429,7 +430,7 @@ def write_raster(
             for number, text in enumerate(descriptions, 1):
                 file.set_band_description(number, text)
             file.set_band_unit(1, unit)
-            file.update_tags(**(tags or {}))
+            file.update_tags(TIFFTAG_SOFTWARE=f"terrain-swarm {version('terrain-swarm')}", **(tags or {}))
             factors = [2**n for n in range(1, 8) if max(grid.rows, grid.cols) // 2**n >= 128]
             if factors:
                 file.build_overviews(factors, Resampling.nearest)

@@ -115,8 +115,7 @@ def overruled(found: Any, given: str | None, transform: Any) -> tuple[str, ...]:
     if not (found.is_geographic or found.is_projected):
         nowhere = bool(transform.c == transform.f == 0)
         return (f"! the file has no origin: its north-west corner is x = 0, y = 0 of {given!r}",) * nowhere
-    counts = rasterio.CRS.from_user_input(given)
-    if counts == found:
+    if rasterio.CRS.from_user_input(given) == found:
         return ()
     return (f"terrain.crs = {given!r} counts, though the file says {crs_name(found)}: every place follows from it",)
 

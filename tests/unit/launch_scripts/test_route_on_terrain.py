@@ -120,6 +120,8 @@ def test_the_time_from_everywhere_is_that_of_the_routes_as_raster_and_as_areas(
     with rasterio.open(tmp_path / "s.tif") as file:
         seconds = file.read(1)
         assert (file.crs.to_string(), file.nodata, file.shape, file.units) == (SYSTEM, -1.0, (60, 80), ("s",))
+        assert "slope rule quadratic" in file.tags()["TIFFTAG_IMAGEDESCRIPTION"]
+        assert file.tags()["TIFFTAG_SOFTWARE"].startswith("terrain-swarm ")
     best = find_route(find_scenario(str(hill)), "cell:10,5", "cell:10,75")
     assert seconds[10, 5] == pytest.approx(best.cost_s, rel=1e-5)
     assert "the file exists; --force replaces it" in swarm(f"{line}/s.tif")[2]

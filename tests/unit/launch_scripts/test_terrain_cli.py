@@ -62,6 +62,7 @@ def test_cost_writes_a_geotiff_with_overviews_and_a_picture(made: Path, tmp_path
     with rasterio.open(tmp_path / "cost.tif") as file:
         pace = file.read(1)
         assert (file.nodata, file.crs.to_epsg(), file.overviews(1)) == (-1, 32632, [2])
+        assert "slope rule quadratic" in file.tags()["TIFFTAG_IMAGEDESCRIPTION"]
     assert ((pace == -1) | (pace > 0)).all()
     assert (tmp_path / "cost.png").stat().st_size > 50_000
 
