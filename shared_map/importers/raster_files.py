@@ -363,10 +363,9 @@ def _driver(head: bytes, ending: str, what: str) -> str:
     begun = (driver for magic, driver in _DRIVERS.items() if head.startswith(magic) or text.startswith(magic))
     found = next(begun, _NAMELESS.get(ending))
     if found is None:
-        if other := other_format(head):
-            raise TerrainError(f"{what} {other}")
         known = ", ".join(dict.fromkeys(_DRIVERS.values()))
-        raise TerrainError(f"{what} is no raster: it begins with {head[:8]!r}, as none of {known} does")
+        other = other_format(head) or f"is no raster: it begins with {head[:24]!r}, expected {known}"
+        raise TerrainError(f"{what} {other}")
     return found
 
 
