@@ -13,8 +13,9 @@ import numpy as np
 import typer
 
 from launch_scripts.commands.terrain_routes import DescribedRoute, metres_along, write_route
-from launch_scripts.observe.run_observer import frame_of_run
+from launch_scripts.observe.run_observer import ask_run, frame_of_run
 from shared_map.terrain.map_frame import MapFrame
+from swarm.config.explain import choice
 from swarm.config.vehicle_classes import GROUND
 from swarm.errors import BusError, ConfigError, TerrainError
 from swarm.grid import walk
@@ -98,8 +99,12 @@ def ask_planner(bus: Bus, where: object, target: str, start: Place, vehicle_clas
     row, col = frame.grid.row_col(cell)
     request = RouteRequest(row=row, col=col, vehicle_class=vehicle_class)
     began_s = time.monotonic()
-    missing = f"no planner of target {target!r} answers {where}; `swarm status` lists the targets"
-    reply = _reply(bus, ROUTE, request, RouteReply, missing, target=target)
+    try:
+        reply = _reply(bus, ROUTE, request, RouteReply, "", target=target)
+    except BusError:
+        needed = {process.partition("planner-")[2] for member in ask_run(bus) for process in member.crew}
+        there = choice(target, sorted(needed - {""}), " there are: ")
+        raise BusError(f"no planner of target {target!r} answers {where}{there}") from None
     return Answer(reply, frame, cell, (time.monotonic() - began_s) * 1e3)
 
 

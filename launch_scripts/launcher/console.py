@@ -43,7 +43,7 @@ _READER_GONE = frozenset((errno.EPIPE, errno.EIO, errno.EBADF, errno.ENXIO))
 _FILES = (("report", "report.json"), ("report", "report.html"), ("picture", "report.png"))
 _LEVELS = {"red": logging.ERROR, "yellow": logging.WARNING}
 REPORTED = {
-    "seconds": "seconds",
+    "seconds": "run, s",
     "startup_s": "start-up, s",
     "processes": "needed processes",
     "restarts": "restarts",

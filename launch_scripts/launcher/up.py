@@ -43,7 +43,7 @@ from shared_map.vehicle_class_grounds import prepare_classes
 from swarm.bus.bus import Bus
 from swarm.bus.endpoints import listening
 from swarm.bus.zenoh_bus import open_bus
-from swarm.clock import NS_PER_S, MonotonicClock
+from swarm.clock import MonotonicClock
 from swarm.config.scenario import UNTIL_STOPPED_S
 from swarm.errors import BusError, StoreError, SwarmError
 from swarm.peers import Peer, job_of
@@ -78,7 +78,6 @@ def run_swarm(options: run_options.UpOptions) -> int:
     run_id, started_ns = _run_id_of(options)
     run_dir = run_options.make_run_dir(options.runs, run_id)
     log_to(run_dir / LAUNCHER_LOG, options.log_format, Speaker(LAUNCHER, "0", run_id))
-    log.info("began %.2f s ago", time.monotonic() - options.began_s)
     run = None
     try:
         run = _Run(options, run_id, run_dir, started_ns)
@@ -127,10 +126,8 @@ class _Run:
         self.begun = False
         """True if everything that can be refused before a process starts has been accepted."""
         self._startup_s: float | None = None
-        self._routed = False
-        """True if a route was served."""
         self._up_at_s: float | None = None
-        """Time when the swarm was whole, on the run's clock."""
+        """time.monotonic() when the swarm was whole."""
         self._web_port = 0
         self._outlasts = False
         """True while the run goes on for a viewer only."""
@@ -316,19 +313,14 @@ class _Run:
             watcher.listen(_TURN_S if self._startup_s is None else _CALM_TURN_S)
             self._tell(watcher)
             now_s = time.monotonic()
-            if watcher.routes_served and not self._routed:
-                self._routed = True
-                log.info("the first route is served, %.2f s after launch", now_s - self._options.began_s)
             if self._startup_s is None and self._is_up(watcher):
                 self._startup_s = now_s - self._options.began_s
-                self._up_at_s = (watcher.now_ns() - self._started_ns) / NS_PER_S
+                self._up_at_s = began_s = now_s
                 self._register()
-                began_s = now_s
-                if watcher.routes_served or not self._all_external:
-                    so_far = "all processes are alive and routes are served"
-                else:
-                    so_far = "all processes are alive, and targets wait for their trackers"
-                self._terminal.say(f"{so_far}, {self._startup_s:.1f} s after launch")
+                served = watcher.routes_served or not self._all_external
+                so_far = "routes are served" if served else "targets wait for their trackers"
+                so_far += f", {self._startup_s:.1f} s after launch{self._limit('; the run lasts')}"
+                self._terminal.say(f"all processes are alive and {so_far}")
                 for line in said_of(self._terrain):  # now: its corners in degrees take a library that is large
                     self._terminal.say(line)
             # Time counts from when the swarm is up; one that never comes up must end too.
@@ -392,25 +384,29 @@ class _Run:
         register(self._run_dir, web_port=self._web_port, is_whole=self._startup_s is not None)
 
     def _show(self, known: Recorder | OwnPart, now_ns: int, missing: list[str]) -> None:
-        elapsed_s = max(now_ns - self._started_ns, 0) / NS_PER_S
         if isinstance(known, OwnPart):
-            title = self._title(f"{known.well} of this machine's", elapsed_s, missing)
+            title = self._title(f"{known.well} of this machine's", missing)
             self._terminal.show(lambda: known.line(title, now_ns, self._swarm.restarts))
             return
         state = known.summary(now_ns)
-        title = self._title(f"{facts.fact('processes_well').shown(state)} needed", elapsed_s, missing)
+        title = self._title(f"{facts.fact('processes_well').shown(state)} needed", missing)
         self._terminal.show(lambda: plain_line(state, title), lambda console: live_table(state, title, console))
 
-    def _title(self, up: str, elapsed_s: float, missing: list[str]) -> str:
-        """Returns the title line of the displays. Its time includes the start-up."""
+    def _title(self, up: str, missing: list[str]) -> str:
+        """Returns the title line of the displays. Its time is that of the start-up, and then that of the run, as
+        the numbers at the end have them."""
+        since_s = time.monotonic() - (self._up_at_s or self._options.began_s)
         if self._up_at_s is None:
-            waits = f", waits for {', '.join(missing)}" * (0 < len(missing) < 4)
-            return f"{self._scenario.name}: starting, {up} processes are up{waits}, {elapsed_s:.0f} s"
-        seconds = self._scenario.seconds
-        of = "" if seconds >= UNTIL_STOPPED_S or self._outlasts else f" of {self._up_at_s + seconds:.0f}"
+            waits = f", waits for {', '.join(missing) or 'the whole swarm'}" * (len(missing) < 4)
+            return f"{self._scenario.name}: starting, {up} processes are up{waits}, {since_s:.0f} s"
+        of = "" if self._outlasts else self._limit(" of")
         until = ", until the live view is closed, or Ctrl-C" if self._outlasts else ""
         live = f"{until}, page {page_of(self._web_port)}" if self._web_port else ""
-        return f"{self._scenario.name}: {elapsed_s:.0f}{of} s{live}"
+        return f"{self._scenario.name}: {since_s:.0f} s{of}{live}"
+
+    def _limit(self, word: str) -> str:
+        """Returns the word and how long the run lasts once the swarm is up; nothing if that has no limit."""
+        return f"{word} {self._scenario.seconds:g} s" if self._scenario.seconds < UNTIL_STOPPED_S else ""
 
     def _raise_refusals(self, endings: list[Ending]) -> None:
         for ending in endings:

@@ -308,7 +308,7 @@ def plan_grid(
             f"{mirrored}the file is mirrored, rotated or upside down; resampled north-up, with voids beside"
         )
     if target == crs and north_up and is_kept(width, height, max(rows, cols), resolution_m):
-        check_size(rows, cols, what)
+        check_size(rows, cols, what, float(transform.a))
         grid = GridSpec(rows, cols, float(transform.a), float(transform.c), float(transform.f), _system(crs))
         return grid, None, notes
     resolution = resolution_m or float(f"{math.sqrt(width * height):.4g}")
@@ -316,7 +316,7 @@ def plan_grid(
     high, wide = int((north - south) / resolution + 1e-6), int((east - west) / resolution + 1e-6)
     if high < 1 or wide < 1:
         raise TerrainError(f"{what} is {north - south:.3g} x {east - west:.3g} m: no cell of {resolution:g} m fits")
-    check_size(high, wide, what)
+    check_size(high, wide, what, resolution)
     notes.append(f"resampled to {high} x {wide} cells of {resolution:g} m in {crs_name(target)}")
     return GridSpec(high, wide, resolution, west, north, _system(target)), target, notes
 
@@ -330,11 +330,11 @@ def _system(crs: Any) -> str:
     return short if is_short else str(crs.to_string())
 
 
-def check_size(rows: int, cols: int, what: str) -> None:
-    """Raises TerrainError unless there are 1 to `MAX_CELLS` cells."""
+def check_size(rows: int, cols: int, what: str, resolution_m: float = 0.0) -> None:
+    """Raises TerrainError unless there are 1 to `MAX_CELLS` cells; with their size it names one that is allowed."""
     if rows < 1 or cols < 1 or rows * cols > MAX_CELLS:
-        times = math.sqrt(max(rows * cols, 0) / MAX_CELLS)
-        coarser = f", or set a terrain.resolution_m that is at least {times:.1f} times coarser" if times > 1 else ""
+        least_m = resolution_m * math.sqrt(max(rows * cols, 0) / MAX_CELLS) * 1.01  # more than three digits lose
+        coarser = f", or set terrain.resolution_m to at least {least_m:.3g}" if least_m > resolution_m else ""
         raise TerrainError(f"{what} has {rows} x {cols} cells; 1 to {MAX_CELLS} are allowed: crop it{coarser}")
 
 

@@ -363,7 +363,7 @@ def _driver(head: bytes, path: Path, what: str) -> str:
     envi = ("ENVI" for header in beside if header.startswith(b"ENVI"))
     if found := next(itertools.chain(begun, envi), _NAMELESS.get(path.suffix.lower())):
         return found
-    raise TerrainError(f"{what} {other_format(head, f'is no raster that is read: it begins with {head[:8]!r}')}")
+    raise TerrainError(f"{what} {other_format(head, f'is no raster that is read: it begins with {head[:24]!r}')}")
 
 
 def _check_virtual(path: Path, what: str, known: dict[Path, float], depth: int = 1) -> float:

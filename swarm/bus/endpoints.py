@@ -18,6 +18,7 @@ log = logging.getLogger(__name__)
 _PAUSE_S = 0.25
 """Between two looks for a router that is not up yet."""
 _OS_ERROR = re.compile(r"\(os error (\d+)\)")
+_RUNS = "is `swarm up` or `swarm role router` running there"
 _KNOCK_S = 1.0
 """Longest wait for an answer of a port. A router of the same network answers within milliseconds."""
 _HINTS = {
@@ -94,12 +95,12 @@ def _why_silent(endpoint: str, encrypted: bool) -> str:
     except TimeoutError:
         return f"no answer within {_KNOCK_S:g} s (is a firewall between?)"
     except ConnectionRefusedError:
-        return "no process listens there (is `swarm role router` running there?)"
+        return f"no process listens there ({_RUNS}?)"
     except (OSError, ValueError) as error:
         return getattr(error, "strerror", None) or str(error)
     if encrypted:
         return (
             "a process listens there, but refuses us or is not a router "
-            "(is `swarm role router` running there, with certificates of the same authority, and no proxy between?)"
+            f"({_RUNS}, with certificates of the same authority, and no proxy between?)"
         )
-    return "a process listens there, but does not reply as a router (is `swarm role router` running there?)"
+    return f"a process listens there, but does not reply as a router ({_RUNS}?)"

@@ -14,7 +14,7 @@ from scipy.io import netcdf_file
 from support.height_models import written
 
 from shared_map.importers.cover.photos import read_photo
-from shared_map.importers.georeference import metres_per_degree
+from shared_map.importers.georeference import check_size, metres_per_degree
 from shared_map.importers.terrain_sources import Source, load_source
 from shared_map.terrain.pace_layers import TerrainClass
 from shared_map.terrain.terrain import build_terrain
@@ -331,3 +331,11 @@ def test_the_built_in_terrain_lies_where_its_degrees_are() -> None:
     grid = load("jacksboro").grid
     (lon,), (lat,) = transform(grid.crs, "EPSG:4326", [grid.west_m], [grid.north_m])
     assert (lon, lat) == (pytest.approx(-84.41375, abs=1e-7), pytest.approx(36.73291667, abs=1e-7))
+
+
+@pytest.mark.parametrize(("rows", "side_m"), [(16_385, 0.33), (99_999, 27.7), (1_536_000, 0.01)])
+def test_a_terrain_with_too_many_cells_names_a_resolution_which_is_allowed(rows: int, side_m: float) -> None:
+    with pytest.raises(TerrainError, match=r"set terrain\.resolution_m to at least ") as refused:
+        check_size(rows, rows, "terrain", side_m)
+    least_m = float(str(refused.value).split()[-1])
+    check_size(int(rows * side_m / least_m), int(rows * side_m / least_m), "terrain", least_m)
