@@ -316,11 +316,11 @@ class _Run:
             if self._startup_s is None and self._is_up(watcher):
                 self._startup_s = now_s - self._options.began_s
                 self._up_at_s = began_s = now_s
-                self._register()
                 served = watcher.routes_served or not self._all_external
                 so_far = "routes are served" if served else "targets wait for their trackers"
                 so_far += f", {self._startup_s:.1f} s after launch{self._limit('; the run lasts')}"
                 self._terminal.say(f"all processes are alive and {so_far}")
+                self._register()  # `up -d` shows what was said before
                 for line in said_of(self._terrain):  # now: its corners in degrees take a library that is large
                     self._terminal.say(line)
             # Time counts from when the swarm is up; one that never comes up must end too.

@@ -56,8 +56,8 @@ def load(path: Path, text: str | bytes | None = None, **settings: object) -> Sou
             "north: 46:30N\nsouth: 45:00N\neast: 9E\nwest: 8E\nrows: 2\ncols: 3\n1 2 3\n4 5 6",
             "north '46:30N', expected a number",
         ),
-        (b"\xff\xfe\x00", "is no raster: it begins with .*expected GTiff.*AAIGrid"),
-        ("", "is no raster: it begins with b'', expected"),
+        (b"\xff\xfe\x00", "is no raster that is read: it begins with .*gdal_translate"),
+        ("", "is no raster that is read: it begins with b''"),
     ],
 )
 def test_a_bad_ascii_grid_is_refused_with_a_sentence(tmp_path: Path, text: str | bytes, words: str) -> None:
