@@ -72,8 +72,8 @@ SEARCH_COUNTS = ("searches", "search_places")
 class Planner:
     """Keeps the tree of one target, and answers from it.
 
-    Each tick applies the newest pose. Changes of the map may wait for a second (`MapIntake`), but no route that is
-    given passes one that waits. At most one full growth is under way; what changes meanwhile is applied when it is
+    Each tick applies the newest pose. Changes of the map may wait for a second (`MapIntake`), but no served route
+    crosses a waiting change. At most one full growth is under way; what changes meanwhile is applied when it is
     adopted. Before the first tree all routes are NO_TARGET, or SEARCHING while the target is unseen. The cost map
     belongs to the caller, which applies marks to it between calls.
 
@@ -142,9 +142,9 @@ class Planner:
         self._puller = Puller(pace, resolution_m, config, climb) if pulls(config, climb) else None
         self._status_due_ns = 0
         self.target_search = target_search
-        """None for one that is not searched for."""
+        """None if the target is never searched for."""
         self._ways = Ways(tree.cost_grid)
-        """To where vehicles of the class are to look."""
+        """Routes of this class's vehicles to search places."""
         is_hidden = target_search is not None and not target_search.tracked
         for name in COUNTS + SEARCH_COUNTS if is_hidden else COUNTS:
             counters.count(name, 0)
@@ -161,7 +161,7 @@ class Planner:
             self.followers.forget_routes()
 
     def set_pace(self, cpu_budget: float, push_s: float) -> None:
-        """Share of a core that this planner may use, and how often it may push a vehicle newer routes."""
+        """Sets the share of a core that it may use, and how often it pushes a vehicle newer routes."""
         self._push_ns = int(push_s * NS_PER_S)
         self.tree.times.set_budget(cpu_budget)
 
@@ -394,7 +394,7 @@ class Planner:
         return self._known(lambda: self.tree.routes(cells, max_cells), now_ns)
 
     def _known(self, find: Callable[[], RouteBatch], now_ns: int) -> RouteBatch:
-        """Routes by what the tree knows of the map. No route passes a later change, as far as it is known here.
+        """Routes by `find`. If a waiting change of the map concerns them, it is applied and they are found again.
 
         Every route that is given to anybody comes through here.
         """

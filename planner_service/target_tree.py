@@ -101,8 +101,8 @@ class State(Enum):
                map changed while there was no target
     CURRENT    it leads to the target as it was last told   a move that takes too long here: BEHIND; a map that
                                                             has changed without a target, or too much: STALE
-    BEHIND     a full growth was left to the worker; until  the worker's tree is adopted: CURRENT; STALE as above
-               then it leads where it led
+    BEHIND     a worker grows the tree; meanwhile it leads  the worker's tree is adopted: CURRENT; STALE as above
+               to the old root
     =========  ===========================================  ====================================================
     """
 
@@ -288,10 +288,10 @@ class TargetTree:
         return Update("full", self._grid.window, self._grid.cells + then.cells, then.wants_full)
 
     def force(self, cells: Any) -> Update:
-        """Forces the range to cover these cells (section 3.3.2): their routes are optimal afterwards.
+        """Forces the range to cover these cells, so that their routes become optimal (section 3.3.2).
 
-        If a full search would hold up answers for long, a worker does it, and they get their routes when that tree
-        is adopted; until then, the best inside a window that holds them and the target, if that is quick enough.
+        If a full search would delay answers for long, a worker does it, and routes are optimal once its tree is
+        adopted; until then they are the best in a window around the cells and the target, if that is quick.
         """
         target = self.target_cell
         if not self.ready or target is None:

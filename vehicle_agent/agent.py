@@ -139,7 +139,7 @@ class Agent:
         self._sight_cells = max(sense_cells, reach_cells + 1)
         """Changes so near concern a vehicle, whatever its route: it looks there, or may hold a cell there."""
         self.seen_lethal: set[int] = set()
-        """Cells in zones over which no way out leads, as vehicles have seen."""
+        """Cells in zones which vehicles saw are truly lethal: no way out crosses them."""
         self._driven_ns: int | None = None
         self._bounds: list[tuple[int, int, int, int]] = []
         """Bounds of the vehicles' routes, and these as an array, a cell wider on each side."""
@@ -203,7 +203,7 @@ class Agent:
             vehicle.lose_planner(now_ns)
 
     def set_pace(self, time_scale: float, reassign_s: float) -> None:
-        """Seconds on the terrain per second, and how often vehicles ask which target is the cheapest."""
+        """Sets terrain seconds per second of the clock, and how often vehicles ask for the cheapest target."""
         self._time_scale = time_scale
         self._driver.patience_ns = int(max(_PATIENCE_S, _PATIENCE * self._map.cell_s(0.5) / time_scale) * NS_PER_S)
         self.assignment.set_period(reassign_s)
@@ -211,7 +211,7 @@ class Agent:
     # --- where vehicles start -------------------------------------------------------------------------------
 
     def place(self, vehicles: Sequence[str]) -> None:
-        """These have found their places."""
+        """Adds vehicles whose places are known."""
         for id in vehicles:
             cell = self.holdings.path(id)[0]
             self.vehicles[id] = Vehicle(id, self._map.grid, cell)
@@ -225,7 +225,7 @@ class Agent:
         return not (self.obstacles.is_deaf or self._steering.closed(cell))
 
     def remove(self, vehicles: Sequence[str]) -> None:
-        """These leave the map: their cells are given back."""
+        """Removes vehicles from the map: their cells are given back."""
         for id in vehicles:
             self.holdings.leave(id)
             self.vehicles.pop(id, None)
@@ -300,7 +300,7 @@ class Agent:
         return driven
 
     def map_changed(self, changed: Sequence[Window], now_ns: int, *, by_others: bool = False) -> None:
-        """Ends routes before cells that are lethal now, and paths also before corners that are lethal now.
+        """Cuts routes before newly lethal cells, and paths also before diagonal steps past one.
 
         changed    the windows with all cells that have changed
         by_others  others may have changed the map: compare the view with it again

@@ -376,7 +376,7 @@ def _to(scenario: Scenario, terrain: Terrain, cell: int, option: str) -> Floats:
 def write_reach(found: Reach, path: Path, every_s: float | None, slack: float) -> None:
     """Writes seconds as a GeoTIFF (-1 where there is no way), or areas of equal time in a format of the exporter.
 
-    every_s  how far apart in time the borders of areas are; None: ten minutes, and a fifth of a corridor's slack
+    every_s  how far apart in time the borders of areas are; None: ten minutes; for a corridor, a fifth of its slack
     slack    of a corridor
 
     Raises ConfigError on another ending or too many areas, StoreError if the file cannot be written.

@@ -46,7 +46,7 @@ _HEADER_LINE = re.compile(rb"\s*$|\W*(?!nan\b)[a-z_]+\s*[:\s]\s*\S+\s*$", re.IGN
 _NUMBER = re.compile(rb"[-+]?((\d+\.?\d*|\.\d+)(e[-+]?\d+)?|inf|infinity|nan)", re.IGNORECASE)
 _SURFER_LINES = 5
 _VOIDS, _COUNTS = {"nodata_value", "nodata", "null"}, {"ncols", "nrows", "cols", "rows", "line 2"}
-"""Names of the word for no height, and of whole numbers; Surfer's header has lines without names."""
+"""Header words of the no-data value, and of whole numbers; Surfer's header has lines without names."""
 _WORDS = {*_VOIDS, "type"}
 _HEADER_LINE_BYTES = 4096
 _TEXT_PIECE_BYTES = 4 << 20
@@ -169,7 +169,7 @@ def _georeferenced(path: Path, what: str, files: contextlib.ExitStack) -> Any:
 
 
 def _check_numbers(dataset: Any, what: str) -> None:
-    """Raises TerrainError if a number by which pixels are placed or scaled is none: GDAL computes with it."""
+    """Raises TerrainError if a transform or scale value is not a finite number: GDAL computes with it."""
     placed = dataset.transform
     if placed.determinant == 0 or not np.isfinite(list(placed)[:6]).all():
         raise TerrainError(f"{what} has pixels without a size; its georeference is damaged")
@@ -434,7 +434,7 @@ def sampled(dataset: Any, indexes: int | tuple[int, ...], most_cells: int) -> An
 
 
 def middle_of(dataset: Any, most_side: int) -> Any:
-    """Returns the window of at most `rows` x `cols` cells in the middle of a dataset."""
+    """Returns the middle window of a dataset, at most `most_side` cells a side."""
     from rasterio.windows import Window
 
     rows, cols = min(dataset.height, most_side), min(dataset.width, most_side)

@@ -1,8 +1,9 @@
 """The shared map without a master: every process holds a replica, and all become equal.
 
-1. A *statement* says of one cell: this pace, lethal, or clear; with a stamp, and perhaps an end (`marks`). An
-   author keeps all its statements about a tile of 32 x 32 cells in one *set*, under a number (epoch, seq). Its set
-   with a higher number replaces the one with a lower number; no other process may write under its name.
+1. A *mark*, here a *statement*, says of one cell: this pace, lethal, or clear; with a stamp, and perhaps an end
+   (`marks`). An author keeps all its statements about a tile of 32 x 32 cells in one *set*, under a number (epoch,
+   seq). Its set with a higher number replaces the one with a lower number; no other process may write under its
+   name.
 2. *The merge law* (`merge`): of all statements about a cell that have not ended the newest wins, of two with one
    stamp that of the larger author; an operator's zone wins over all. It reads nothing but the sets that are held,
    so order, grouping and repetition of what arrives cannot matter: replicas that hold the same sets have the same

@@ -15,7 +15,7 @@ Failures    A thread of the bus that ends by an unexpected error ends the proces
 Deadlines   A query carries its timeout. An `Inbox` refuses what its owner has not taken by then.
 Rejections  A payload that does not parse, or whose sender differs from its key, is counted (`payloads_dropped`),
             logged once per topic and minute, and never posted. If the bus has an `Authenticator`, so is a payload
-            without the run's code, unless `Topic.free` lets strangers say it; such a query is refused.
+            without the run's code, unless `Topic.free` lets strangers send it. A query without the code is refused.
 Misrouting  A payload that names another key than the one under which it came is never posted, and is counted apart
             (`payloads_misrouted`). A query that names another key is refused.
 Bugs        Unknown fields, missing fields, a wildcard where one value is meant: TypeError or ValueError at the
@@ -243,8 +243,8 @@ S = TypeVar("S")
 
 
 def newest_of(topic: Topic, waiting: Iterable[tuple[str, S]], event_of: Callable[[S], Heard | None]) -> list[Heard]:
-    """The events of samples that waited, given with their keys: of a topic of which only the newest value counts,
-    that of each key. A sample that is rejected hides none that came before it.
+    """Returns the events of waiting (key, sample) pairs. If only the newest value of a topic counts, these are the
+    newest accepted sample of each key.
 
     event_of  makes the event of a sample; None if it is rejected
     """

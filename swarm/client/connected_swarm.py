@@ -115,8 +115,8 @@ class Orders:
     ) -> tuple[str, Acknowledged]:
         """Closes an area, or gives it a pace. Returns the zone's name, too.
 
-        polygon_m     corners (x_m, y_m)
-        name          a zone that has it is replaced; the keeper finds one if it is empty
+        polygon_m     corners (x_m, y_m) in the map's frame
+        name          a zone of this name is replaced; empty: the keeper chooses one
         pace_s_per_m  None: no vehicle enters
         for_s         the zone ends by itself; None: never
         vehicle_class  for vehicles of this class only; None: for all

@@ -79,7 +79,7 @@ class OwnMarks:
         return [self._set(tile, now_ns) for tile in changed]
 
     def overruled(self, other: map_data.MarkSet, now_ns: int) -> list[map_data.MarkSet]:
-        """A set under our name. If a keeper took us for dead and shortened ours, the set to put in its place."""
+        """Takes a set under our name; if a keeper took us for dead and shortened it, returns its replacement."""
         mine = self._sets.get(other.tile)
         if mine is None or (other.epoch, other.seq) <= (mine.epoch, mine.seq) or other.epoch + 1 >= 1 << 62:
             return []
@@ -183,9 +183,9 @@ class Vehicle(Reported):
     # --- place --------------------------------------------------------------------------------------------------
 
     def at(self, x_m: float, y_m: float, *, heading_rad: float | None = None, speed_m_per_s: float = 0.0) -> None:
-        """States where the vehicle is. All vehicles of the swarm avoid this place from their next tick on, and
-        where it will be soon. It is repeated until the next call or `leave`: without another call the vehicle
-        counts as at rest.
+        """States where the vehicle is. From their next tick on, all vehicles of the swarm avoid this place and
+        the places ahead. It is sent again and again until the next call or `leave`: without another call the
+        vehicle counts as at rest.
 
         x_m, y_m       in the terrain's frame; of a latitude and longitude: `at(*swarm.frame.from_wgs84(lat, lon))`
         heading_rad    clockwise from north; None if it may go any way
@@ -228,7 +228,8 @@ class Vehicle(Reported):
         and waits until it may enter the first. Returns the cells that it may enter now: no other vehicle enters
         them before the vehicle has left them by its `at`. Reserved cells that are not in `cells` are released.
 
-        Raises ConfigError where cells leap, and unless the vehicle was made with `right_of_way`.
+        Raises ConfigError if a cell is not beside the one before it, and unless the vehicle was made with
+        `right_of_way`.
         """
         way, here = self._has_way(), self.cell
         path = [here, *(cells[1:] if cells and cells[0] == here else cells)]

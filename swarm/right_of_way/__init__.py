@@ -3,7 +3,7 @@ restart.
 
 The map is divided into *shards* (`shards`). Three agents, or four where certificates prove names,
 are the *members* of a shard. One of them is its *leader*, by epoch and majority. A *host* is a process with
-vehicles in a shard or at its border. A *generation* is one incarnation of a host. The leader keeps an order of
+vehicles in a shard or at its border. A *generation* is one numbered start of a host. The leader keeps an order of
 *entries* for each cell (`host_entries`): the vehicle of an entry enters the cell once all before it are over. An
 entry is never revoked and never runs out: only its host ends it.
 
@@ -14,8 +14,8 @@ docs/design/right-of-way.md, and docs/design/external-vehicles.md says how exter
 Duties of a host (`Host`, which keeps what it holds in `Holdings`):
 
 1. Begin with a generation whose number is greater than any known number, and have it on file before the first
-   word. First ask all agents (`KnownRequest`), until enough members of every shard have replied that one of them
-   has its newest usable table.
+   word. First ask all agents (`KnownRequest`), until enough members of every shard have replied for one of them to
+   have its newest usable table.
 2. Tell each shard that concerns it everything about its vehicles there, whenever that is news and once a heartbeat.
    Entries that it omits are over. Send nothing for a vehicle which has only
    driven on, unless it runs short of cells or another waits behind it.
@@ -35,17 +35,19 @@ Duties of a host (`Host`, which keeps what it holds in `Holdings`):
 Duties of a leader:
 
 1. Add an entry at the end of a cell's order only, and one to a cell and table. Remove it only by a statement of its
-   host that knows the table which added it and omits it, or by proof that its generation has ended.
+   host that knows the table which added it, and does not list the entry, or by proof that its generation has ended.
 2. Put a vehicle only behind one that goes on or will give back, and never so that it would wait for itself. Grant
    cells further ahead than a vehicle keeps only where no other is near.
-3. Begin with the newest table that a majority knows, and tell hosts of no table before a majority has it on file.
+3. Begin with the newest table that any of a majority has on file, and tell hosts of no table before a majority has
+   it on file.
 
-Messages (`swarm.wire.messages.traffic`), each of which but `Left` carries the whole state of its key:
+Messages (`swarm.wire.messages.traffic`), of which all but `Left` and a `Table` of changes carry the whole state of
+their key:
 
 `HostState`     Host to leader: all vehicles of the host that hold or want a cell of one shard, each with its
                 next cells (`Stand`, made of a `Wish`). `knows` is the newest table that the host acts on: of
-                what that added, the host holds no more than it lists. `dead` are generations that are proved to
-                have ended, by which their entries are over.
+                all entries up to that table, the host holds only those listed in this state. `dead` are generations
+                that are proved to have ended, by which their entries are over.
 `Table`         Leader to members: the entries of one shard, or those that differ from an earlier table. Its stamp
                 is (epoch, seq).
 `Stored`        Member to members: the table of this stamp is on file here. On two of three files it is usable. Said
@@ -58,8 +60,8 @@ Messages (`swarm.wire.messages.traffic`), each of which but `Left` carries the w
                 entries of which it lacks the host's statement.
 `Left`          Host to host: these entries are over.
 `Claim`         Member to members, where no leader was heard for 0.6 s, longer where round trips are: who answers
-                with its table promises to store nothing of a lower epoch. Two promises make a leader, which goes on
-                from the newest table of the two.
+                with its table promises to store nothing of a lower epoch. The promises of a majority make a leader,
+                which goes on from their newest table.
 `KnownRequest`  New generation to all agents: what is on file of this host?
 `Known`         The answer: the greatest generation in any table, the shards that list entries of the host, and, for
                 an external vehicle, who the agents are and how large shards are.

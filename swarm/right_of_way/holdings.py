@@ -141,7 +141,8 @@ class Holdings:
         self._paths: dict[str, list[int]] = {}
         """Vehicle that has a place -> the cells that it holds, in driving order; another list when they change."""
         self._pushed: dict[str, int] | None = None
-        """Vehicle -> the age with which it is asked to make way; None when a leader has spoken."""
+        """Vehicle -> the age with which it is asked to make way; None: to be collected again, since a leader has
+        spoken."""
         self._said: dict[str, _Said] = {}
         self._seen_anew: set[str] = set()
         """Vehicles to which another table grants other cells: their requests may change."""
@@ -230,7 +231,8 @@ class Holdings:
 
     def enter(self, vehicle: str, cell: int) -> None:
         """States the cell of a vehicle that has no place: its body is there, or it would enter there. If an earlier
-        generation of ours held it, it takes it, and releases all others. The newest call counts."""
+        generation of ours held that cell, the vehicle takes it over and releases its other cells. The newest call
+        counts."""
         if vehicle not in self._paths:
             self._entries.enter(vehicle, cell)
             self.watch([self.shards.of(cell)])
@@ -406,7 +408,7 @@ class Holdings:
         self._views.setdefault(shard, _View()).same = False
 
     def lefts(self, now_ns: int) -> list[Left]:
-        """Returns the words of ours for which vehicles of other hosts wait, if they are new or a heartbeat old. A
+        """Returns the `Left` messages for which vehicles of other hosts wait, if they are new or a heartbeat old. A
         replaced generation says none."""
         words: dict[str, list[Number]] = {}
         for shard, view in () if self.replaced else self._views.items():
@@ -422,8 +424,7 @@ class Holdings:
         return [Left(agent=self.name, host=host, entries=numbers) for host, numbers in words.items()]
 
     def _say_changed(self, wishes: Mapping[str, Wish]) -> None:
-        """Makes the statements about vehicles that have a place again where their path, wish or granted cells have
-        changed."""
+        """Renews the statement about each placed vehicle whose path, wish or granted cells have changed."""
         anew, self._seen_anew = self._seen_anew, set()
         for vehicle, path in self._paths.items():
             before, wish = self._said.get(vehicle), wishes.get(vehicle, _NO_WISH)

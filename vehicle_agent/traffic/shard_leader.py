@@ -2,7 +2,7 @@
 word.
 
 An entry is never revoked, and no other is put before it (see docs/design/right-of-way.md for the proof). No vehicle
-waits for one that stays: it follows only those that have an entry behind the cell.
+waits for one that stays: it follows only those that have an entry farther on their path, or give this one back.
 """
 
 from __future__ import annotations
@@ -231,8 +231,8 @@ class Leader:
         return self._told
 
     def granted(self, table: Table, now_ns: int) -> Iterator[Granted]:
-        """Returns the table's content for each host that has spoken lately, if it is new or the last message is a
-        heartbeat old."""
+        """Returns the table's content for each host that has spoken lately, if it is new or `_TOLD_AGAIN_NS` have
+        passed since the last message."""
         if is_said(table.stamp, self._said_of, now_ns - self._said_ns, _TOLD_AGAIN_NS):
             return
         self._said_of, self._said_ns = table.stamp, now_ns
@@ -334,8 +334,8 @@ class Leader:
         return not self._goes_on(order[number], number)
 
     def _goes_on(self, vehicle: str, number: Number) -> bool:
-        """Returns True if a vehicle of which the host has spoken lately has an entry behind this one, or gives this
-        one back as soon as it is followed."""
+        """Returns True if a vehicle of which the host has spoken lately has an entry farther on its path, or gives
+        this one back as soon as it is followed."""
         stand, entries = self._stands.get(vehicle), self._orders.entries(vehicle)
         if stand is None or number not in entries or self._orders.is_fenced(number[0]):
             return False

@@ -56,7 +56,7 @@ COLUMNS: Mapping[Kind, tuple[str, ...]] = {
 """Columns of the class: OSM's own keys, and the one of extracts as Shapefiles."""
 TAGS = ("bridge", "tunnel", "area", "inclusion")
 _EXTENTS: Mapping[str, Sequence[float]] = _TABLES["extents"]
-"""Columns of a point's or a line's own extent, in any case -> its width over it, and the largest width, metres."""
+"""Columns for the extent of points and lines, in any letter case -> (width / value, largest width in metres)."""
 PACKED = ("other_tags", "tags")
 """Columns that hold further tags: as GDAL writes them, or JSON."""
 

@@ -55,12 +55,12 @@ class Held(msgspec.Struct, frozen=True, array_like=True):
         return cls(cells[0], turns, [(*stamp, len([*run])) for stamp, run in runs])
 
     def __post_init__(self) -> None:
-        stamps = self.stamps
-        count = stamps[0][2] if len(stamps) == 1 else sum(run[2] for run in stamps)
-        if count != len(self):
+        stamps, turns = self.stamps, self.turns
+        count = stamps[0][2] if len(stamps) == 1 else sum([run[2] for run in stamps])
+        if count != (len(turns) + 1 if stamps else 0):
             raise ValueError("expected as many stamps as cells")
         # No cell is further from the first than this, and most are near: that is known without computing each.
-        reach = count * sum(map(abs, self.turns))
+        reach = count * sum(map(abs, turns)) if turns else 0
         if not _LEAST_CELL + reach <= self.first < _MOST_CELLS - reach and not all(
             _LEAST_CELL <= cell < _MOST_CELLS for cell in self.cells
         ):
