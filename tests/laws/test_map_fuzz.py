@@ -8,7 +8,7 @@ import random
 import msgspec
 import numpy as np
 import pytest
-from support.map_strategies import GRID, Acknowledged, Composite, held_winners, naive_winners, set_of
+from support.map_strategies import GRID, Acknowledged, Composite, held_winners, naive_winners, set_of, sets_asked
 from support.swarm_model import SwarmModel
 
 from shared_map.keeper.mark_store import KeeperStore
@@ -68,7 +68,7 @@ def test_mutated_sets_merge_by_the_rules_or_not_at_all() -> None:
     lasting = [each for each in through if fault(each, GRID) is None]
     if not any(each.untils_ns for each in lasting):
         assert held_winners(replicas[0]) == naive_winners(lasting)
-    assert replicas[0].held.answer(MarksRequest()) == replicas[1].held.answer(MarksRequest())
+    assert sets_asked(replicas[0], MarksRequest()) == sets_asked(replicas[1], MarksRequest())
     assert held_winners(replicas[0]) == held_winners(replicas[1])
 
 
@@ -88,7 +88,7 @@ def test_mutated_messages_of_many_sets_merge_by_the_rules_or_not_at_all() -> Non
         singly.merge([each])
     for first in range(0, len(through), 500):
         together.merge(through[first : first + 500])
-    assert together.held.answer(MarksRequest()) == singly.held.answer(MarksRequest())
+    assert sets_asked(together, MarksRequest()) == sets_asked(singly, MarksRequest())
     assert held_winners(together) == held_winners(singly)
 
 
@@ -126,9 +126,9 @@ def test_mutated_payloads_on_the_bus_neither_stop_a_service_nor_keep_true_marks_
     author.sync.publish(author.replica.write([5, 2700], MarkKind.LETHAL, 0.0, swarm.now_ns))
     swarm.run(3)
     for replica in (listener.replica, keeper.replica):
-        assert replica.held.answer(FEW) == author.replica.held.answer(FEW)
+        assert sets_asked(replica, FEW) == sets_asked(author.replica, FEW)
     assert acknowledged.not_yet(author) == 0
-    assert len(list(store.load())) == len(keeper.replica.held.answer(MarksRequest()))
+    assert len(list(store.load())) == len(sets_asked(keeper.replica, MarksRequest()))
 
 
 def test_requests_for_what_nobody_has_are_answered_with_nothing() -> None:
@@ -136,5 +136,5 @@ def test_requests_for_what_nobody_has_are_answered_with_nothing() -> None:
     for each in examples():
         replica.merge([each])
     odd = msgspec.structs.replace(FEW, authors=["x" * 64], tiles=[10**9])
-    assert replica.held.answer(odd) == []
+    assert sets_asked(replica, odd) == []
     assert replica.missing({"a1.1": np.array([(4_000_000_000, 9, 9)], DIGEST_ROW).tobytes()}) == []

@@ -14,6 +14,7 @@ from support.map_strategies import (
     naive_winners,
     replica_of,
     set_of,
+    sets_asked,
 )
 
 from shared_map.replication import merge as merge_module
@@ -56,7 +57,7 @@ def assert_equal_now_and_later(
     """Two replicas and their maps, also once statements have ended."""
     assert many.same(single)
     assert together.held.ledger.held() == singly.held.ledger.held()
-    assert together.held.answer(MarksRequest()) == singly.held.answer(MarksRequest())
+    assert sets_asked(together, MarksRequest()) == sets_asked(singly, MarksRequest())
     assert (together.held.capacity.sets, together.held.capacity.marks) == (
         singly.held.capacity.sets,
         singly.held.capacity.marks,
@@ -115,10 +116,10 @@ def test_what_was_lost_is_fetched_after_comparing_digests(sets: list[MarkSet], l
     partial, partial_composite = replica_of([each for each, gone in zip(sets, lost, strict=False) if not gone])
     asked = partial.missing(whole.held.ledger.held())
     for author, tiles in asked:
-        for each in whole.held.answer(MarksRequest(authors=[author], tiles=tiles)):
+        for each in sets_asked(whole, MarksRequest(authors=[author], tiles=tiles)):
             assert partial.merge([each]).sets == [each], "only what differs is fetched"
         theirs = list(whole.held.asked(MarksRequest(), author))
-        assert [each for each in theirs if each] == whole.held.answer(MarksRequest(authors=[author]))
+        assert [each for each in theirs if each] == sets_asked(whole, MarksRequest(authors=[author]))
         assert theirs.count(None) == len(theirs) / 2, "only tiles of the author are looked at"
     assert partial.missing(whole.held.ledger.held()) == []
     assert fingerprint(partial.held.ledger.held()) == fingerprint(whole.held.ledger.held())
@@ -189,7 +190,7 @@ def test_what_has_no_room_is_not_asked_for_again() -> None:
     whole, _ = replica_of([])
     whole.merge([set_of("a", tile, 1, {0: (LETHAL, 0, 1)}) for tile in range(4)])
     bounded = MapReplica(GRID, capacity=Capacity(max_sets=8))
-    for each in whole.held.answer(MarksRequest()):
+    for each in sets_asked(whole, MarksRequest()):
         bounded.merge([each])
     assert bounded.missing(whole.held.ledger.held()) == []
     whole.merge([set_of("a", 1, 2, {})])

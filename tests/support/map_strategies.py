@@ -15,7 +15,7 @@ from shared_map.replication.tiles import tile_cells
 from swarm.bus.bus import Bus, Event, Heard
 from swarm.config.vehicle_classes import MOST_CLASSES
 from swarm.grid import GridSpec
-from swarm.wire.messages.map_data import SEQ_STEP, Digest, MarkKind, MarkSet
+from swarm.wire.messages.map_data import SEQ_STEP, Digest, MarkKind, MarkSet, MarksRequest
 from swarm.wire.topics import DIGEST
 
 settings.register_profile(
@@ -101,6 +101,11 @@ class Composite:
 
     def same(self, other: Composite) -> bool:
         return bool((self.all_kinds == other.all_kinds).all() and (self.all_paces == other.all_paces).all())
+
+
+def sets_asked(replica: MapReplica, request: MarksRequest, author: str | None = None) -> list[MarkSet]:
+    """The sets of a replica which a request asks for."""
+    return [each for each in replica.held.asked(request, author) if each is not None]
 
 
 def merge_one(replica: MapReplica, each: MarkSet) -> list[int] | None:

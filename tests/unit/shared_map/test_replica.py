@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from support.map_strategies import GRID, Composite, merge_one, replica_of, retract, set_of
+from support.map_strategies import GRID, Composite, merge_one, replica_of, retract, set_of, sets_asked
 
 from shared_map.replication.marks import MAX_AHEAD_NS, Statements, mark_set, statements
 from shared_map.replication.replica import MapReplica
@@ -136,9 +136,9 @@ def test_a_request_is_narrowed_by_authors_tiles_and_the_asked_key() -> None:
     sets = [set_of(author, tile, 1, {0: (LETHAL, 0, 1)}) for tile in (0, 3) for author in ("a", "b", "c")]
     replica, _ = replica_of(sets)
     some = MarksRequest(authors=["c", "a"], tiles=[3, 5, 3])
-    assert [*filter(None, replica.held.asked(MarksRequest()))] == sets
-    assert [*filter(None, replica.held.asked(some))] == [sets[3], sets[5]]
-    assert [*filter(None, replica.held.asked(MarksRequest(), author="b"))] == [sets[1], sets[4]]
+    assert sets_asked(replica, MarksRequest()) == sets
+    assert sets_asked(replica, some) == [sets[3], sets[5]]
+    assert sets_asked(replica, MarksRequest(), author="b") == [sets[1], sets[4]]
 
 
 # --- marks that end by themselves ---------------------------------------------------------------------------

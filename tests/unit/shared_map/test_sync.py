@@ -4,7 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import pytest
-from support.map_strategies import Composite, set_of
+from support.map_strategies import Composite, set_of, sets_asked
 from support.swarm_model import LossyLinks, SwarmModel, SyncService
 
 from shared_map.keeper.mark_store import KeeperStore
@@ -164,7 +164,7 @@ def test_keepers_without_end_have_few_sets_put_again() -> None:
         said = set_of(f"x{n // 6}.1", n % 6, 1, {5: (LETHAL, 0, 1)})
         liar.publish(MARKS, said, region=0, tile=said.tile, author=said.author)
     swarm.run(4)
-    assert len([*filter(None, listener.replica.held.asked(MarksRequest()))]) == 360
+    assert len(sets_asked(listener.replica, MarksRequest())) == 360
     put: list[Event] = []
     swarm.network.bus("ear").subscribe(MARKS, put.append)
     for n in range(300):
@@ -198,7 +198,7 @@ def test_nobody_speaks_for_another_in_an_answer_of_many_sets_either() -> None:
     liar.serve(MARKS, answer, author="liar")
     late = swarm.listener("late")
     swarm.run(0.1)
-    held = filter(None, late.replica.held.asked(MarksRequest()))
+    held = sets_asked(late.replica, MarksRequest())
     assert [(each.author, each.tile) for each in held] == [("liar", 1)]
     assert late.replica.counts["sets_refused"] == 1
 
