@@ -342,9 +342,7 @@ def test_on_our_router_each_role_does_what_the_table_allows_and_nothing_else(rol
 
 @pytest.mark.zenohd
 @pytest.mark.parametrize("role", EVERYBODY)
-def test_on_zenohd_each_role_does_what_the_table_allows_and_nothing_else(
-    role: str, routed_by_zenohd: Stage
-) -> None:
+def test_on_zenohd_each_role_does_as_the_table_allows_and_nothing_else(role: str, routed_by_zenohd: Stage) -> None:
     compare(role, routed_by_zenohd)
 
 

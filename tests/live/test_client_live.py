@@ -54,9 +54,7 @@ def test_a_complete_program_has_twenty_lines_at_most(name: str) -> None:
     assert len([line for line in (EXAMPLES / name).read_text().splitlines() if line.strip()]) <= 20
 
 
-def test_a_program_that_ends_without_closing_ends_well_and_its_vehicle_leaves(
-    live: LiveSwarm, swarm: Swarm
-) -> None:
+def test_a_program_that_ends_unclosed_ends_well_and_its_vehicle_leaves(live: LiveSwarm, swarm: Swarm) -> None:
     text = """
 from swarm.client import connect
 swarm = connect("tcp/127.0.0.1:7447")

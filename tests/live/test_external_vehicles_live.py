@@ -86,9 +86,7 @@ def session_of(live: LiveSwarm, run: RunInfo, name: str, file: Path) -> External
     return ExternalSession(name, GridSpec(run.rows, run.cols, run.resolution_m), bus, GenerationFile(file))
 
 
-def test_a_program_of_ones_own_drives_dies_comes_back_and_leaves(
-    live: LiveSwarm, run: RunInfo, tmp_path: Path
-) -> None:
+def test_ones_own_program_drives_dies_comes_back_and_leaves(live: LiveSwarm, run: RunInfo, tmp_path: Path) -> None:
     path = route_of(live, GridSpec(run.rows, run.cols, run.resolution_m))
     command = [sys.executable, "-c", ROVER, live.endpoint, tmp_path / "rover", *path[:6]]
     program = subprocess.Popen(list(map(str, command)), stdout=subprocess.PIPE, text=True)

@@ -75,9 +75,7 @@ def until_complete(screenshot: Callable[[], bytes], folder: Path, within_s: floa
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="needs chromium: apt-get install chromium")
-def test_a_browser_shows_the_ground_and_each_target_with_its_vehicles_and_asks_nobody_else(
-    shown: Rig, tmp_path: Path
-) -> None:
+def test_a_browser_shows_ground_targets_and_vehicles_and_asks_nobody_else(shown: Rig, tmp_path: Path) -> None:
     assert shown.sinks.page is not None
     browser = Browser(tmp_path / "profile", SIZE)
     try:

@@ -113,9 +113,7 @@ def pair(tmp_path: Path, live: LiveSwarm, swarm: Swarm) -> Iterator[Pair]:
         sys.stdout.write(f"--- {child.output.name}\n{child.output.read_text()[-4000:]}\n")  # shown of a failure
 
 
-def test_a_vehicle_that_only_speaks_mavlink_is_avoided_and_gone_when_its_adapter_is_killed(
-    pair: Pair, swarm: Swarm
-) -> None:
+def test_a_vehicle_of_mavlink_alone_is_avoided_and_gone_when_its_adapter_dies(pair: Pair, swarm: Swarm) -> None:
     with swarm.observer() as watching:
         pair.vehicle()
         adapter = pair.adapter("--id", "rover")
@@ -142,9 +140,7 @@ def test_without_arm_a_mission_is_uploaded_and_the_vehicle_stays_where_it_is(pai
     assert len(set(re.findall(r"^at (.*)$", vehicle.output.read_text(), re.MULTILINE))) == 1
 
 
-def test_with_arm_it_drives_to_the_target_and_goes_on_after_either_side_was_killed(
-    pair: Pair, swarm: Swarm
-) -> None:
+def test_with_arm_it_drives_to_the_target_and_goes_on_after_either_side_died(pair: Pair, swarm: Swarm) -> None:
     with swarm.observer() as watching:
         first = pair.vehicle()
         adapter = pair.adapter("--target", "t", "--arm", "--id", "rover")

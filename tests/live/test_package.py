@@ -99,9 +99,7 @@ def test_each_package_names_the_smallest_extra_which_brings_it() -> None:
         assert [each for each in (*smaller, extra) if name in brings[each]] == [extra], module
 
 
-def test_the_command_and_every_public_import_say_in_a_bare_install_what_to_install(
-    wheel: Path, tmp_path: Path
-) -> None:
+def test_the_command_and_every_public_import_say_in_a_bare_install_what_to_add(wheel: Path, tmp_path: Path) -> None:
     env = tmp_path / "env"
     subprocess.run([sys.executable, "-m", "venv", env], check=True, timeout=60)
     done = run(env, f"pip install --no-index --no-deps {wheel}")

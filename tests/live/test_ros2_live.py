@@ -129,9 +129,7 @@ def test_a_latched_map_comes_to_who_comes_late(running: Gateway, session: zenoh.
     node.close()
 
 
-def test_a_peer_of_another_domain_or_distribution_is_named_in_the_log(
-    running: Gateway, session: zenoh.Session
-) -> None:
+def test_a_peer_of_another_domain_or_distribution_is_logged(running: Gateway, session: zenoh.Session) -> None:
     elsewhere = PeerNode(session, "far", TYPES, domain=7)
     elsewhere.subscribe("/map", ROWS["map"].type_name, lambda message: None)
     eventually(lambda: "node far subscribes to /map in domain 7" in running.said, 15, "the word about a domain")

@@ -49,7 +49,7 @@ def issue(hands: Hands, *arguments: str) -> Path:
     return certs
 
 
-def test_launchers_on_two_machines_make_one_run_each_with_the_certificates_of_its_own_processes(
+def test_launchers_on_two_machines_make_one_run_each_with_certificates_of_its_own_processes(
     hands: Hands,
 ) -> None:
     certs = issue(hands)

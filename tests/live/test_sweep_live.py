@@ -39,9 +39,7 @@ def test_a_worker_that_is_killed_loses_no_trial_and_changes_no_result(tmp_path: 
 
 
 @pytest.mark.thorough
-def test_a_trial_that_kills_its_workers_is_given_up_and_the_others_are_not(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_a_trial_that_kills_its_workers_is_given_up_and_no_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     trials = plan(load_study(write_study(tmp_path)), tmp_path, "x")[0].trials
     monkeypatch.setattr(sweep, "run_trial", dies_of_seed_one)
     monkeypatch.setitem(sweep._SETTINGS, "distributed.scheduler.allowed-failures", 1)
@@ -85,9 +83,7 @@ def test_a_sweep_that_is_stopped_keeps_what_it_had_and_goes_on_from_there(tmp_pa
     assert (out / RESULTS).is_file()
 
 
-def test_a_scheduler_that_is_there_is_used_and_one_that_is_not_is_named(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-):
+def test_a_scheduler_that_is_there_is_used_and_an_absent_one_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     trial = plan(load_study(write_study(tmp_path)), tmp_path, "x")[0].trials[0]
     with local_client(1) as there, client_of(there.scheduler_info()["address"]) as client:
         [(_, result)] = run_trials(client, [trial])

@@ -71,9 +71,7 @@ def rewritten(run: Path, folder: Path, process: str, changed: list[Record]) -> P
 
 
 @pytest.mark.parametrize("seed", [4, 11])
-def test_every_process_of_a_run_with_faults_gives_the_same_when_it_is_replayed(
-    seed: int, run: Path, tmp_path: Path
-) -> None:
+def test_every_process_of_a_faulty_run_gives_the_same_when_replayed(seed: int, run: Path, tmp_path: Path) -> None:
     replayed = list(replay_run(run if seed == 4 else record(tmp_path, seed, 3)))
     assert {each.recorded.head.role for each in replayed} == {"keeper", "planner", "targets", "agent"}
     assert seed != 4 or max(each.recorded.generation for each in replayed) > 1  # crashes
@@ -83,9 +81,7 @@ def test_every_process_of_a_run_with_faults_gives_the_same_when_it_is_replayed(
         assert each.outcome.outputs > 5
 
 
-def test_what_a_planner_reads_of_clock_and_kernels_is_an_input(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_what_planners_read_of_clock_and_kernels_is_input(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     scenario = msgspec.structs.replace(
         SMALL, seed=4, planner=msgspec.structs.replace(SMALL.planner, strategy="multi_resolution")
     )
@@ -225,9 +221,7 @@ def test_a_file_that_is_no_recording_is_said_and_the_others_are_replayed(run: Pa
 
 
 @pytest.mark.parametrize("field", ["role", "id", "versions"])
-def test_a_recording_names_no_file_elsewhere_and_nothing_that_a_terminal_obeys(
-    field: str, run: Path, tmp_path: Path
-) -> None:
+def test_a_recording_names_no_file_elsewhere_and_steers_no_terminal(field: str, run: Path, tmp_path: Path) -> None:
     head, *whole = recorded_of(run, "keeper-0")
     for wrong in ("x/../../y", "\x1b[31m", "a\n", ""):
         value = {wrong: "\x1b"} if field == "versions" else wrong
@@ -260,9 +254,7 @@ def test_bytes_that_match_their_checksum_and_are_no_records_are_said_too(run: Pa
         assert found.why is not None
 
 
-def test_a_recording_that_is_full_says_so_and_is_the_same_until_there(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_full_recording_says_so_and_agrees_until_there(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(recording_file.RecordWriter.__init__, "__defaults__", (5_000,))
     record(tmp_path, 4, 2)
     found = list(replay_run(tmp_path))
@@ -283,9 +275,7 @@ def test_a_replay_ends_at_the_time_that_is_asked_for(run: Path) -> None:
     assert any(outcome is not None and 2.5 < outcome.seconds <= 3.0 for outcome in outcomes)
 
 
-def test_the_command_says_what_is_the_same_and_exits_with_1_where_something_differs(
-    run: Path, tmp_path: Path
-) -> None:
+def test_the_command_says_what_is_the_same_and_exits_with_1_if_something_differs(run: Path, tmp_path: Path) -> None:
     told = CliRunner().invoke(app, ["replay", str(run), "--process", "keeper-0", "--json"])
     assert told.exit_code == 0, told.output
     found = json.loads(told.stdout)

@@ -226,9 +226,7 @@ def table_of(state: RunState) -> str:
 
 
 @pytest.mark.parametrize(("scenario", "plan"), [run[1:] for run in RUNS], ids=[run[0] for run in RUNS])
-def test_no_fact_that_is_shown_in_two_places_differs(
-    scenario: Scenario, plan: Callable[[OrderedSimulation], None]
-) -> None:
+def test_no_fact_shown_in_two_places_differs(scenario: Scenario, plan: Callable[[OrderedSimulation], None]) -> None:
     watched = Watched(scenario)
     simulation = watched.simulation
     plan(simulation)

@@ -61,7 +61,7 @@ def leaders(simulation: Simulation, target: str) -> list[str]:
 
 
 @pytest.mark.seeds(2)
-def test_the_leader_of_each_target_dies_for_good_and_every_query_is_answered_again_within_a_second(
+def test_the_leader_of_each_target_dies_for_good_and_queries_are_answered_again_within_a_second(
     seed: int,
 ) -> None:
     crashes = tuple(Crash(8 + 2.3 * n, f"planner-t{n}", for_good=True) for n in range(2))

@@ -94,7 +94,7 @@ def network(folder: Path) -> NetworkConfig:
     return NetworkConfig(tls=tls, revoked=("agent.all.a9",))
 
 
-def test_names_are_added_once_and_in_order_and_a_router_denies_them_beside_those_of_its_scenario(
+def test_names_are_added_once_in_order_and_a_router_denies_them_and_those_of_its_scenario(
     tmp_path: Path,
 ) -> None:
     assert with_revocations(network(tmp_path)) == network(tmp_path)
@@ -122,7 +122,7 @@ def test_a_file_that_is_no_list_of_names_is_refused(tmp_path: Path, content: byt
         with_revocations(network(tmp_path))
 
 
-def test_what_cannot_be_read_or_written_is_an_error_that_names_it_and_a_wrong_name_changes_nothing(
+def test_what_cannot_be_read_or_written_is_named_and_a_wrong_name_changes_nothing(
     tmp_path: Path,
 ) -> None:
     revoke(tmp_path, ["keeper.0"])

@@ -99,9 +99,7 @@ def test_what_a_scenario_needs_and_ends_soon_is_made_anew_with_the_hosts_that_it
         check_signed(certs / "ca.pem", certs / f"{name}.pem", certs / f"{name}.key")
 
 
-def test_zenohd_admits_the_processes_of_a_scenario_and_needs_one_with_certificates(
-    tmp_path: Path, scenario: Path
-) -> None:
+def test_zenohd_admits_the_processes_of_a_scenario_and_needs_certificates(tmp_path: Path, scenario: Path) -> None:
     certs, out = tmp_path / "certs", tmp_path / "zenohd.json5"
     run("certs", certs, "--scenario", scenario)
     files = ("--tls-ca", certs / "ca.pem", "--tls-cert", certs, "--tls-key", certs)

@@ -140,9 +140,7 @@ def test_a_launcher_that_has_ended_is_not_taken_for_the_process_which_has_its_pi
 
 
 @pytest.mark.parametrize("is_ours", [True, False])
-def test_a_process_which_outlives_its_launcher_is_seen_and_ended(
-    is_ours: bool, tmp_path: Path, swarm: Swarm
-) -> None:
+def test_what_outlives_its_launcher_is_seen_and_ended(is_ours: bool, tmp_path: Path, swarm: Swarm) -> None:
     """It is stopped, so that it does not notice the end. A program of another kind is shown and left alone."""
     make_run(tmp_path, "r", 9)
     changed(tmp_path, pid=NOBODY)

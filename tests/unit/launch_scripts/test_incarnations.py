@@ -35,9 +35,7 @@ def test_of_many_that_start_at_once_each_gets_a_number_of_its_own(tmp_path: Path
     assert len(set(found)) == 20
 
 
-def test_a_file_that_was_changed_is_written_again_from_the_clock(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_changed_file_is_written_again_from_the_clock(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     now_ns = 1_800_000_000 * 10**9
     monkeypatch.setattr(run_options.time, "time_ns", lambda: now_ns)
     path = tmp_path / "lives" / "agent-a0"

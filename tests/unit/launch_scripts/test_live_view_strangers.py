@@ -95,9 +95,7 @@ def test_a_second_request_on_a_connection_does_not_slip_in_behind_the_first(sink
     assert told.count(b"HTTP/1.1 ") == 1, told
 
 
-def test_connections_and_their_threads_are_bounded_and_the_idle_ones_cut(
-    sinks: Sinks, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_connections_are_bounded_and_the_idle_ones_cut(sinks: Sinks, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(sinks.page.server, "lasts_s", 1.5)
     port, before = sinks.web_port, threading.active_count()
     with contextlib.ExitStack() as stack:

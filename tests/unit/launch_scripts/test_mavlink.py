@@ -237,9 +237,7 @@ def test_a_vehicle_that_asks_without_end_is_given_up() -> None:
         (Autopilot(0, 0), [(codec.ARM_DISARM, 1), (codec.MISSION_START, 0)]),
     ],
 )
-def test_with_arm_it_is_armed_and_driven_in_the_order_of_its_make(
-    vehicle: Autopilot, steps: list[tuple[int, int]]
-) -> None:
+def test_with_arm_it_is_armed_and_driven_as_its_make_asks(vehicle: Autopilot, steps: list[tuple[int, int]]) -> None:
     driving(Wishes("t0", arm=True), vehicle, seconds=20.0)
     made = [
         (each.command, mode_of(each)) for each in vehicle.commands if each.command != codec.SET_MESSAGE_INTERVAL

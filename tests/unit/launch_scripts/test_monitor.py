@@ -127,9 +127,7 @@ def test_an_instance_has_three_components_of_which_one_says_who_it_is(
     )
 
 
-def test_whoever_opens_the_view_late_has_all_of_it_soon(
-    scenario: Scenario, terrain: Terrain, tmp_path: Path
-) -> None:
+def test_who_opens_the_view_late_has_all_of_it_soon(scenario: Scenario, terrain: Terrain, tmp_path: Path) -> None:
     """The server may have dropped old data: the drawings after a viewer came hold every component."""
     longer = msgspec.structs.replace(scenario, seconds=16.0)
     rig = Rig(longer, terrain, tmp_path / "run.rrd", audience=NOBODY)
@@ -163,9 +161,7 @@ def test_while_nobody_looks_half_the_frames_are_drawn_and_packed_together(
 
 
 @pytest.mark.parametrize("name", ["a0-03", "t1"])
-def test_the_camera_follows_a_vehicle_or_a_target(
-    scenario: Scenario, terrain: Terrain, tmp_path: Path, name: str
-) -> None:
+def test_the_camera_follows_who_is_named(scenario: Scenario, terrain: Terrain, tmp_path: Path, name: str) -> None:
     following = msgspec.structs.replace(scenario, monitor=MonitorConfig(live=False, follow=name))
     recorded(following, terrain, tmp_path)
     led = [tuple(row[0]) for row in components(tmp_path / "run.rrd", "/world/followed")["translation"]]
@@ -288,9 +284,7 @@ def listeners() -> set[str]:
 
 
 @pytest.mark.network
-def test_page_and_stream_are_served_on_loopback_only_and_the_page_cannot_call_home(
-    terrain: Terrain, tmp_path: Path
-) -> None:
+def test_page_and_stream_are_served_on_loopback_only_and_cannot_call_home(terrain: Terrain, tmp_path: Path) -> None:
     sinks = Sinks("r", tmp_path / "run.rrd", LIVE, make_blueprint(TerrainMesh(terrain)))
     url = sinks.page.server.url
     try:

@@ -139,9 +139,7 @@ ids = st.sampled_from(["t0", "t1", "t2", "t3"])
 
 @settings(deadline=None)
 @given(st.sets(ids), st.sets(ids), st.sets(ids))
-def test_no_target_has_two_labels_and_none_that_is_drawn_has_none(
-    posed: set[str], lost: set[str], seen: set[str]
-) -> None:
+def test_every_target_that_is_drawn_has_one_label(posed: set[str], lost: set[str], seen: set[str]) -> None:
     pins, sightings = target_labels(sorted(posed), lost, seen)
     assert not pins.keys() & sightings.keys()
     assert pins.keys() | sightings.keys() == posed | seen
@@ -317,7 +315,7 @@ GRID = GridSpec(4, 7, 10.0)
 @given(st.integers(-(1 << 31), (1 << 32) - 1) | st.integers(-3, 30) | st.none())
 @example(-(1 << 31))
 @example(27)
-def test_an_alarm_is_told_wherever_it_says_that_it_is_and_has_a_place_if_that_is_in_the_grid(
+def test_an_alarm_is_told_wherever_it_says_it_is_and_has_a_place_if_that_is_in_the_grid(
     cell: int | None,
 ) -> None:
     alarm = Alarm("target-lost", "t0", "nobody knows", 3.0, cell=cell, target="t0", heard_s=90.0)
@@ -331,9 +329,7 @@ def test_an_alarm_is_told_wherever_it_says_that_it_is_and_has_a_place_if_that_is
 
 @given(st.text(max_size=20), st.text(max_size=20), st.text(max_size=60))
 @example("down", "\x1b]0;x\x07", "a\nb\x9b2J")
-def test_an_alarm_is_one_line_that_no_terminal_obeys_whatever_a_process_says(
-    kind: str, about: str, text: str
-) -> None:
+def test_an_alarm_is_one_line_that_no_terminal_obeys_whatever_it_says(kind: str, about: str, text: str) -> None:
     latest = LatestState(RunPlan((), (), 0, 1), GRID)
     told = WireAlarm(kind=kind, about=about, text=text, since_ns=1, over_ns=2)
     latest.heard(stats(alarms=[told]), 2)

@@ -135,9 +135,7 @@ def test_a_commented_scenario_is_read_as_what_was_written(
 # --- swarm check ------------------------------------------------------------------------------------------
 
 
-def test_check_says_all_at_once_in_the_order_of_weight(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, swarm: Swarm
-) -> None:
+def test_check_says_all_at_once_by_weight(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, swarm: Swarm) -> None:
     monkeypatch.setattr(machine, "this_machine", lambda runs: machine.Resources(1, 1 << 20, 1 << 10))
     (tmp_path / "s.toml").write_text(
         '[terrain]\nsource = "synthetic"\nrows = 24\ncols = 24\nrelief_m = 1\n'

@@ -69,9 +69,7 @@ def read_layers(folder: Path) -> dict[str, list[Any]]:
     }
 
 
-def test_a_geojson_has_every_place_and_time_in_wgs84(
-    run: Path, recorder: Recorder, tmp_path: Path, swarm: Swarm
-) -> None:
+def test_geojson_has_places_and_times_in_wgs84(run: Path, recorder: Recorder, tmp_path: Path, swarm: Swarm) -> None:
     code, out, _ = swarm(f"runs export {run.name} --runs", run.parent, "--out", tmp_path)
     assert (code, "4 vehicle_tracks" in out) == (0, True)
     layers = read_layers(tmp_path)

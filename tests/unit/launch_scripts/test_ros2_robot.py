@@ -100,7 +100,7 @@ def test_a_goal_that_is_refused_ends_the_one_before_and_the_plan_says_so(frame: 
     assert [each.level for each in world.node.heard["/one/plan_certificate"]] == [Level.ERROR]
 
 
-def test_what_is_called_as_a_vehicle_of_the_swarm_is_no_robot_and_said_once(
+def test_what_is_called_as_a_vehicle_of_ours_is_no_robot_and_said_once(
     caplog: pytest.LogCaptureFixture,
 ) -> None:
     taken = {"two"}

@@ -199,9 +199,7 @@ def test_a_route_across_180_degrees_is_one_line(tmp_path: Path) -> None:
         write_route(site, tmp_path / "way.kml")
 
 
-def test_a_route_to_where_one_is_takes_nothing_and_is_a_line_of_two_points(
-    hill: Path, tmp_path: Path, swarm: Swarm
-) -> None:
+def test_a_route_to_where_one_is_takes_nothing_and_has_two_points(hill: Path, tmp_path: Path, swarm: Swarm) -> None:
     for ending in ("geojson", "kml"):
         line = f"route --terrain {hill} --from cell:55,5 --to cell:55,5 --out {tmp_path}/way.{ending}"
         assert "at most 0.00% above the optimum" in swarm(line)[1]

@@ -210,9 +210,7 @@ def test_every_frame_hangs_on_the_terrain(heard: dict[str, list[tuple[int, Any]]
         assert parents[parents[f"{ros_name(each.id)}/base_link"]] == "map"
 
 
-def test_marks_are_in_the_last_grid_as_they_were_at_the_end(
-    heard: dict[str, list[tuple[int, Any]]], tracks: RunTracks
-) -> None:
+def test_the_last_grid_has_the_marks_of_the_end(heard: dict[str, list[tuple[int, Any]]], tracks: RunTracks) -> None:
     grids = [np.array(told.data, np.int8) for _, told in heard["/marks"]]
     assert len(grids) > 1
     for before, after in itertools.pairwise(grids):

@@ -167,7 +167,7 @@ def test_an_hour_of_kills_leaves_as_much_in_memory_as_a_minute_of_them_and_no_co
     assert live(60, 3600) < 1.1 * minute
 
 
-def test_names_that_strangers_make_up_take_a_bounded_memory_and_known_ones_are_heard(
+def test_made_up_names_take_a_bounded_memory_and_known_ones_are_heard(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     observe = "launch_scripts.observe"
@@ -331,7 +331,7 @@ def test_the_live_table_has_a_line_per_target(recorder: Recorder) -> None:
     assert (first.captures, second.captures) == (0, 2)
 
 
-def test_a_target_whose_tracker_is_lost_says_so_in_table_line_and_report_until_it_is_back(
+def test_a_target_with_a_lost_tracker_says_so_in_table_line_and_report_until_it_is_back(
     recorder: Recorder,
 ) -> None:
     recorder.alive(Peer("planner", "t0", 1), True, 0)

@@ -106,7 +106,7 @@ EVENTS = (
 
 @settings(max_examples=few(200), deadline=None)
 @given(st.lists(st.sampled_from(EVENTS), max_size=30))
-def test_nobody_is_asked_before_successors_are_ready_and_no_two_generations_write_one_file(
+def test_nobody_is_asked_before_successors_are_ready_and_each_file_has_one_writer(
     history: list[str],
 ) -> None:
     with pytest.MonkeyPatch.context() as patch:
@@ -149,7 +149,7 @@ def test_a_planner_that_never_has_a_tree_holds_nothing_up_for_ever(monkeypatch: 
     assert machine.asked == [(LAUNCHER, signal.SIGTERM)]
 
 
-def test_who_crashed_before_is_begun_once_the_launcher_before_starts_it_no_more(
+def test_who_crashed_is_begun_once_the_launcher_before_starts_it_no_more(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     machine = Machine(monkeypatch)
@@ -173,7 +173,7 @@ def test_an_agent_whose_generation_before_crashed_is_waited_for_no_longer(monkey
     assert machine.asked == [(LAUNCHER, signal.SIGTERM)]
 
 
-def test_a_launcher_that_was_killed_is_followed_and_nobody_is_sent_a_signal(
+def test_a_launcher_that_was_killed_is_followed_and_nobody_is_signalled(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     machine = Machine(monkeypatch)
@@ -188,9 +188,7 @@ def test_a_launcher_that_was_killed_is_followed_and_nobody_is_sent_a_signal(
     assert machine.one("router-0").alive
 
 
-def test_of_two_that_take_over_at_once_the_later_one_is_refused(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_of_two_who_take_over_at_once_the_later_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(takeover, "writing", lambda _: [os.getpid(), LAUNCHER, 101])
     with pytest.raises(ConfigError, match=r"2 launchers run in .*, pids 100, 101: wait until one has taken over"):
         TakeOver(tmp_path, [], [], print)

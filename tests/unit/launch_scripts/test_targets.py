@@ -115,9 +115,7 @@ def test_a_captured_target_turns_up_far_away() -> None:
         (29, {"state": VehicleState.ARRIVED}, True),  # it is believed when it is near
     ],
 )
-def test_only_a_vehicle_in_reach_that_chases_a_target_captures_it(
-    col: int, how: dict[str, Any], captures: bool
-) -> None:
+def test_only_a_chaser_within_reach_captures_its_target(col: int, how: dict[str, Any], captures: bool) -> None:
     world = World(still())
     world.settle()
     assert len(world.hear(world.grid.cell(20, col), **how)) == 2 * captures

@@ -143,9 +143,7 @@ def test_the_shell_gets_its_words_from_the_command_itself(swarm: Swarm, monkeypa
 # --- swarm doctor -------------------------------------------------------------------------------------------------
 
 
-def test_doctor_looks_at_everything_and_says_how_it_is(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, swarm: Swarm
-) -> None:
+def test_doctor_says_how_everything_is(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, swarm: Swarm) -> None:
     monkeypatch.chdir(tmp_path)
     code, said, _ = swarm("doctor")
     assert code == 0
