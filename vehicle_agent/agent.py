@@ -35,6 +35,9 @@ from vehicle_agent.target_choice import AskCosts, Assignment, GroupCosts
 from vehicle_agent.traffic.detours import Detours
 from vehicle_agent.traffic.next_cells import FAR_CELLS, CellRequests, Steering
 
+_MANY_WAIT = 0.025
+"""Share of the vehicles. In free traffic fewer wait, and a third of the CPU time of 1,000 vehicles went into acts
+between ticks; in crowds more do (`bench crowd`)."""
 _LONGEST_STEP_S = 0.5
 _PATIENCE, _PATIENCE_S = 8.0, 1.0
 """Longest wait behind vehicles that do not go on: in times of a cell, and in seconds; the longer counts."""
@@ -179,6 +182,11 @@ class Agent:
     def goals_taken(self) -> bool:
         """True if the vehicles go by the book of goals as it is."""
         return self._goals_taken == self.goals.book.version
+
+    @property
+    def many_wait(self) -> bool:
+        """Returns True if so many vehicles wait to enter a cell that acting between ticks helps them."""
+        return len(self._steering.waiting_ns) >= _MANY_WAIT * len(self.vehicles)
 
     def goal_states(self, left: Collection[str]) -> list[GoalState]:
         """The state of each vehicle that was sent somewhere.
