@@ -179,8 +179,8 @@ class AgentService(MemberService):
                 pass
 
     def _act(self, now_ns: int) -> None:
-        """Acts on messages between two ticks, a few times per driven cell, while many vehicles wait: an act takes as
-        long as a tick."""
+        """Acts on messages between two ticks, a few times per driven cell, while many vehicles wait: an act takes
+        as long as a tick."""
         acts = self._acted_ns and now_ns - self._acted_ns >= self._parts.act_ns and self.agent.many_wait
         if acts and not self.agent.holdings.replaced:
             self._acted_ns = now_ns

@@ -27,7 +27,7 @@ from launch_scripts.observe.palette import colours_of_groups, rgb, round_length,
 from launch_scripts.report.npz_files import RunTracks, Track
 from launch_scripts.report.plots_and_cards import PLOTS, cards, draw_plot, halo, headline, saved
 from launch_scripts.report.run_gis_layers import groups_of
-from shared_map.array_files import Floats
+from shared_map.array_files import Bools, Bytes, Floats
 from shared_map.learning.learned_factors import keys_of
 from shared_map.terrain.pyramid import Level, any_in_blocks, level_of
 from shared_map.terrain.terrain import Terrain
@@ -43,7 +43,6 @@ _MOST_PIXELS = 1 << 20
 _MOST_POINTS = 60_000
 """Points of all tracks: more would be slow to look at."""
 Points = NDArray[np.float64]
-Pixels = NDArray[np.uint8]
 
 
 def size_km(grid: GridSpec) -> tuple[float, float]:
@@ -117,7 +116,7 @@ def in_km(track: Track, grid: GridSpec, step: int = 1) -> Points:
     return np.stack([xy_m[:, 0] - grid.west_m, grid.north_m - xy_m[:, 1]], axis=1) / 1000
 
 
-def mark_overlay(tracks: RunTracks) -> Pixels:
+def mark_overlay(tracks: RunTracks) -> Bytes:
     """Marked cells, uint8 (rows, cols, 4); of a large grid blocks of cells in which any is marked."""
     grid, marks = tracks.grid, tracks.marks
     side = max(1, math.ceil(math.sqrt(grid.cells / _MOST_PIXELS)))
@@ -171,7 +170,6 @@ _MOST_CELLS = 1 << 20
 _HATCH_PX, _EDGE_PX = 11, 2
 """Pixels between lines of a hatch, and of an outline. The page draws these 1,600 pixels on some 1,060: lines stay 7
 apart, which tells a hatch from a grey, and an outline stays wider than a pixel."""
-Bools = NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False)
@@ -183,7 +181,7 @@ class GroundPicture:
     level   of the terrain, that was drawn
     """
 
-    pixels: Pixels
+    pixels: Bytes
     drawn: tuple[str, ...]
     level: Level
 

@@ -45,7 +45,7 @@ def said_of_bad(pace: Floats, window: Window) -> str:
 
 log = logging.getLogger(__name__)
 
-_NONE: Floats = np.empty(0, np.float32)
+NO_COSTS: Floats = np.empty(0, np.float32)
 _NO_STATUSES: NDArray[np.uint8] = np.empty(0, np.uint8)
 
 
@@ -108,20 +108,20 @@ class CostGrid:
                 f"resolution_m is {grid.resolution_m:g}, planner.length_weight {config.length_weight:g}; expected"
                 f" {_SHORTEST_M:g} to {_LONGEST_M:g} and 0 or more"
             )
-        self.cell_cost: Floats = _NONE
+        self.cell_cost: Floats = NO_COSTS
         """float32 (size,), s: price of a straight step into each cell; inf is lethal, as is the border. Empty
         before `load` or `share`; `apply` writes it, in place."""
         self.lowest_cell_cost = math.inf
         """s; the lowest cell cost, inf if all is lethal. `load` and `apply` set it."""
         self.highest_cell_cost = 0.0
         """s; the highest finite cell cost, 0 if all is lethal. `load` and `apply` set it."""
-        self.rounding = Rounding.of(_NONE)
+        self.rounding = Rounding.of(NO_COSTS)
         """Rounding of labels of trees on this map. `load`, `share` and `apply` put another in its place."""
         self._time_cost: Floats | None = None
         """Same as `time_cost`, if that is an array of its own. `load` and `share` set it, `apply` writes it."""
         self._lowest_time = math.inf
         """s; the lowest of `time_cost`."""
-        self._range = self._time_range = CostRange(_NONE)
+        self._range = self._time_range = CostRange(NO_COSTS)
         """Range of `cell_cost` and of `_time_cost`. `load` and `share` put others in their place, `apply` changes
         them: those of a snapshot are not its own."""
         self._offsets = layout.step_offsets(self.stride)

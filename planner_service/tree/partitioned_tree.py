@@ -18,7 +18,7 @@ from planner_service.kernels import partition, partition_search, partition_total
 from planner_service.kernels.layout import NONE, PaddedGrid
 from planner_service.kernels.lower_bounds import WindowBound
 from planner_service.tree.cost_changes import Cells, Changes
-from planner_service.tree.cost_grid import CostGrid
+from planner_service.tree.cost_grid import NO_COSTS, CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree, grow_window
 from planner_service.tree.queue_choice import KeptScratch
 from shared_map.array_files import Floats
@@ -237,9 +237,6 @@ def in_cells(tree: AnyTree) -> CostToGoTree:
     return whole
 
 
-_NONE: Floats = np.empty(0, np.float32)
-
-
 @dataclass(frozen=True, eq=False)
 class GrownTree:
     """An exact tree, grown by a worker on a snapshot of the map. Arrays are padded, as `kernels.layout` says.
@@ -298,7 +295,7 @@ def growth_job(
             reach = cost_grid.grow(cost_grid.pad(target_cell), cost, parent)
         pieces = None
         if in_pieces and reach >= 0:
-            cost = _NONE  # given back before the pieces take as much
+            cost = NO_COSTS  # given back before the pieces take as much
             pieces = PartitionedTree(cost_grid)
             pieces.take(target_cell, parent)
         heuristic = None if pieces is not None else cost.copy() if reach >= 0 else cost

@@ -9,7 +9,7 @@ from planner_service.kernels import lower_bounds as kernels
 from planner_service.kernels.repair import repair
 from planner_service.kernels.route_walk import OK
 from planner_service.tree.cost_changes import Changes
-from planner_service.tree.cost_grid import CostGrid
+from planner_service.tree.cost_grid import NO_COSTS, CostGrid
 from planner_service.tree.cost_to_go import NO_WINDOW, CostToGoTree
 from planner_service.tree.partitioned_tree import PartitionedTree
 from shared_map.array_files import Floats
@@ -66,7 +66,7 @@ class LowerBounds:
         """
         grid = self._grid
         cost = tree.cost_at(starts) if cost is None else cost
-        heuristic = _NONE if self._heuristic is None else self._heuristic
+        heuristic = NO_COSTS if self._heuristic is None else self._heuristic
         bound = np.empty(starts.size)
         kernels.bound_costs(
             *(cost, starts, grid.rounding.cheapest, tree.slack if tree.exact else _NOT_EXACT),
@@ -78,7 +78,6 @@ class LowerBounds:
 
 _NOT_EXACT = (-1.0, 0.0)
 """In place of a tree's slack, which is 0 or more."""
-_NONE: Floats = np.empty(0, np.float32)
 _NO_PARENTS: NDArray[np.uint8] = np.empty(0, np.uint8)
 
 
