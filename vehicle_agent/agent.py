@@ -185,7 +185,7 @@ class Agent:
 
     @property
     def many_wait(self) -> bool:
-        """Returns True if so many vehicles wait to enter a cell that acting between ticks helps them."""
+        """Returns True if enough vehicles wait to enter a cell for acts between ticks to help them."""
         return len(self._steering.waiting_ns) >= _MANY_WAIT * len(self.vehicles)
 
     def goal_states(self, left: Collection[str]) -> list[GoalState]:
