@@ -37,7 +37,7 @@ from vehicle_agent.traffic.next_cells import FAR_CELLS, CellRequests, Steering
 
 _MANY_WAIT = 0.025
 """Share of the vehicles. In free traffic fewer wait, and a third of the CPU time of 1,000 vehicles went into acts
-between ticks; in crowds more do (`bench crowd`)."""
+between ticks; in crowds more do (`bench crowd`). Up to 40 vehicles are so few that one may always wait."""
 _LONGEST_STEP_S = 0.5
 _PATIENCE, _PATIENCE_S = 8.0, 1.0
 """Longest wait behind vehicles that do not go on: in times of a cell, and in seconds; the longer counts."""
@@ -186,7 +186,7 @@ class Agent:
     @property
     def many_wait(self) -> bool:
         """Returns True if enough vehicles wait to enter a cell for acts between ticks to help them."""
-        return len(self._steering.waiting_ns) >= _MANY_WAIT * len(self.vehicles)
+        return len(self._steering.waiting_ns) + 1 >= _MANY_WAIT * len(self.vehicles)
 
     def goal_states(self, left: Collection[str]) -> list[GoalState]:
         """The state of each vehicle that was sent somewhere.
