@@ -18,12 +18,10 @@ from swarm.clock import NS_PER_S
 from swarm.wire.fields import column, pack_column
 from swarm.wire.messages.vehicles import MOST_SHARED_TARGETS, NO_TARGET, SharedCosts, VehicleState
 from vehicle_agent.assignment import HYSTERESIS, Assigner, CostTable
-from vehicle_agent.driving.driven_vehicle import Vehicle
+from vehicle_agent.driving.driven_vehicle import STRANDED_RETRY_NS, Vehicle
 
 _RETRY_NS = NS_PER_S // 2
 """Vehicles for which no planner has answered ask again so soon: a planner needs about that long to start."""
-_STRANDED_RETRY_NS = 3 * NS_PER_S
-"""Vehicles without a path ask again so soon: only a changed map gives them one."""
 _JUMPS_APART_NS = NS_PER_S // 50
 """For each target: this time after a request a jump of a target may cause the next. With many targets one always
 jumps, and every agent would ask every planner all the time. Up to 25 targets nothing waits for it."""
@@ -268,7 +266,7 @@ class Assignment:
                 vehicle.no_way()
             stuck = stuck or vehicle.state in (VehicleState.IDLE, VehicleState.STRANDED)
         if stuck:
-            retry_ns = _STRANDED_RETRY_NS if self._costs_s else _RETRY_NS
+            retry_ns = STRANDED_RETRY_NS if self._costs_s else _RETRY_NS
             self._due_ns = min(self._due_ns, now_ns + retry_ns)
         if self.group is None:
             return None

@@ -34,7 +34,7 @@ from swarm.config.plugin_names import plugins_of
 from swarm.config.scenario import Scenario, TlsConfig
 from swarm.config.vehicle_classes import GROUND, flies
 from swarm.errors import BusError, ConfigError, SwarmError, TerrainError
-from swarm.grid import REGION_CELLS, GridSpec, Window
+from swarm.grid import REGION_CELLS, GridSpec
 from swarm.places import Given, cell_of
 from swarm.plugins.find import find_plugin
 from swarm.right_of_way.shards import FEWEST_FOR_MAJORITY, Shards, fitting_regions
@@ -238,10 +238,9 @@ def one_way_ground(scenario: Scenario, terrain: Terrain, truth: Floats) -> Itera
 def one_way_share(ground: TrueTerrain) -> float:
     """Returns the share of the connected ground outside the largest part in which each cell is reached from each
     other."""
-    from scipy.sparse import csgraph
+    from scipy.sparse.csgraph import connected_components
 
-    _, graph = ground.steps_graph(Window(0, 0, ground.grid.rows, ground.grid.cols))
-    _, parts = csgraph.connected_components(graph, directed=True, connection="strong")
+    _, parts = connected_components(ground.all_steps, directed=True, connection="strong")
     sizes = counted(parts[ground.home], int(parts.max()) + 1)
     return float(1.0 - sizes.max() / len(ground.home))
 

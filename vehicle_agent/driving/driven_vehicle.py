@@ -162,7 +162,8 @@ class Follower:
 
 _RETRY_NS = NS_PER_S // 5
 _LONGEST_RETRY_NS = 3 * NS_PER_S
-_STRANDED_RETRY_NS = 3 * NS_PER_S
+STRANDED_RETRY_NS = 3 * NS_PER_S
+"""Vehicles without a path ask again so soon: only a changed map gives them one."""
 PREFETCH_CELLS = 8
 """The next part of a partial route is requested when so few cells are left."""
 
@@ -379,7 +380,7 @@ class Vehicle:
                 self._ask_later(now_ns)
             elif self._strands():
                 self._need = Reason.ASSIGNED
-                self._ask_due_ns = now_ns + _STRANDED_RETRY_NS
+                self._ask_due_ns = now_ns + STRANDED_RETRY_NS
         self._settle()
 
     def no_answer(self, now_ns: int) -> None:

@@ -24,8 +24,8 @@ around it (docs/design/reported-obstacles.md): both are to happen, the second mo
 _PUBLISHED_AGAIN_NS = NS_PER_S // 2
 """Interval at which a rover at rest is published. Hosts that have just begun listen for a second for every obstacle
 (docs/design/reported-obstacles.md), and a report that is lost must not end the lease."""
-_LONGEST_TICK_S = 1.0
-"""After a longer pause of its process a rover does not make up for the rest: a leap keeps the old place closed
+LONGEST_TICK_S = 1.0
+"""After a longer pause of its process no target or rover makes up for the rest: a leap keeps the old place closed
 until the lease ends."""
 _LEGS_PER_S = 0.25
 """Chance per second that a leg ends: it takes 4 s in the mean, so within seconds a rover drives, stands and
@@ -90,7 +90,7 @@ class Rovers:
         reports = []
         for rover in self.all.values():
             if time_scale > 0.0:
-                self._move(rover, min(passed_s, _LONGEST_TICK_S))
+                self._move(rover, min(passed_s, LONGEST_TICK_S))
             speed = self._speed(rover) if rover.turns or rover.rests_s <= 0.0 else 0.0
             state = (rover.x_m, rover.y_m, rover.heading_rad, speed)
             if state == rover.published and 0 <= now_ns - rover.published_ns < _PUBLISHED_AGAIN_NS:

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from launch_scripts.simulation.world import walks
 from launch_scripts.simulation.world.referee import Broken, Referee
-from launch_scripts.simulation.world.rovers import Rovers
+from launch_scripts.simulation.world.rovers import LONGEST_TICK_S, Rovers
 from shared_map.array_files import Bools, Floats, private_copy
 from shared_map.terrain.map_frame import MapFrame
 from shared_map.terrain.pace_layers import inflate, inflation_halves
@@ -41,7 +41,6 @@ PATIENCE_NS = 5 * NS_PER_S
 """It waits this time for the answer of a planner that is alive."""
 JUMP_COOL_DOWN_NS = 2 * NS_PER_S
 STAY_COOL_DOWN_NS = 5 * NS_PER_S
-_LONGEST_TICK_S = 1.0
 TRACKER = "targets"
 """The name under which this process and its standbys tell poses: a later generation takes over at once."""
 _WAYS_PER_TICK = 1
@@ -271,7 +270,7 @@ class TargetWorld:
         if self._started_ns is None:
             self._started_ns = self._ticked_ns = now_ns
         time_scale = 0.0 if self.paused else self._time_scale
-        elapsed_s = min((now_ns - self._ticked_ns) / NS_PER_S, _LONGEST_TICK_S) * time_scale
+        elapsed_s = min((now_ns - self._ticked_ns) / NS_PER_S, LONGEST_TICK_S) * time_scale
         self._ticked_ns = now_ns
         waited_ns = now_ns - self._started_ns
         self._budget.ways = _WAYS_PER_TICK

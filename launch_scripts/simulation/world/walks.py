@@ -10,6 +10,7 @@ import math
 import random
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
@@ -138,10 +139,14 @@ class TrueTerrain:
 
     def reached_from(self, cell: int) -> set[int]:
         """The cells to which a way leads from a cell, and that itself."""
-        from scipy.sparse import csgraph
+        from scipy.sparse.csgraph import breadth_first_order
 
-        _, graph = self.steps_graph(Window(0, 0, self.grid.rows, self.grid.cols))
-        return {*csgraph.breadth_first_order(graph, cell, return_predecessors=False).tolist()}
+        return {*breadth_first_order(self.all_steps, cell, return_predecessors=False).tolist()}
+
+    @cached_property
+    def all_steps(self) -> csr_array[np.float64]:
+        """The graph of all possible steps between the cells of the grid, as of `steps_graph`."""
+        return self.steps_graph(self.grid.window)[1]
 
     def steps_graph(self, window: Window) -> tuple[NDArray[np.int64], csr_array[np.float64]]:
         """The cells of a window, int64 (n,), and the graph of all possible steps between them (n, n): an edge costs
