@@ -244,10 +244,11 @@ def in_background(*, as_json: bool) -> int:
 def _chosen(name: str | None, only: bool = False) -> KnownRun:
     """The run of a name or folder; without one the newest active run, else the newest ended one. Raises
     ConfigError, with `only` also if several runs are active."""
-    from launch_scripts.observe.run_folder import RUNS, find_run
+    from launch_scripts.observe.run_folder import LAST, RUNS, find_run
     from launch_scripts.observe.run_registry import registered
 
-    if name is None:
+    # LAST is the newest run of this folder; in a folder without runs it must not end one of several others.
+    if name is None or (name == LAST and not os.path.isdir(RUNS / LAST)):
         if not (known := registered()):
             raise ConfigError("no run of yours is registered on this machine; `swarm up SCENARIO` starts one")
         running = [each for each in known if each.launchers]

@@ -121,7 +121,7 @@ def test_a_run_is_found_by_its_name_from_any_folder_until_its_folder_goes(
     ):
         find_run("first", Path("runs"))
     with pytest.raises(ConfigError, match=r"expected the name or folder of one: second, /.*/first/first$"):
-        _chosen(None, only=True)
+        _chosen("LAST", only=True)  # here is no run of which that could be the newest
     (tmp_path / "third" / "first").rmdir()
     (tmp_path / "second").rename(tmp_path / "away")
     assert [run.name for run in registered()] == ["second", "first"], "the launcher of the second one runs"
