@@ -190,13 +190,13 @@ class Session:
         found: Future[Route] = Future()
 
         def finish(done: Future[list[Any]]) -> None:
-            error = done.exception()
-            if error is not None:
-                found.set_exception(BusError(f"no route to {target!r}: {error}"))
-                return
-            reply: RouteReply = done.result()[0]
+            if not found.set_running_or_notify_cancel():
+                return  # its asker has given up
             try:
+                reply: RouteReply = done.result()[0]
                 found.set_result(Route.of(self.frame, reply.routes[0], reply))
+            except SwarmError as error:
+                found.set_exception(BusError(f"no route to {target!r}: {error}"))
             except (ValueError, IndexError) as error:
                 found.set_exception(BusError(f"the planner of {target!r} answers nonsense: {error}"))
 

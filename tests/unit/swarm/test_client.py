@@ -161,11 +161,13 @@ def test_two_programs_with_one_id_are_both_told_whose_word_counts(world: Swarm) 
 # --- routes -------------------------------------------------------------------------------------------------------
 
 
-def test_a_route_is_the_planners_and_costs_what_it_says(world: Swarm) -> None:
+def test_a_route_is_the_planners_and_costs_what_it_says(world: Swarm, caplog: pytest.LogCaptureFixture) -> None:
     rover = Program(world).swarm.vehicle("rover")
     rover.at(*GRID.centre_m(GRID.cell(30, 3)))
-    asked = rover.route_soon("t")
+    asked, given_up = rover.route_soon("t"), rover.route_soon("t")
+    assert given_up.cancel()
     world.run(0.1)
+    assert "exception calling callback" not in caplog.text
     route = asked.result(0)
     assert route.ok
     assert (route.cells[0], route.cells[-1]) == (GRID.cell(30, 3), GRID.cell(5, 40))
