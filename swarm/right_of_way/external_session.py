@@ -11,12 +11,13 @@ import logging
 import secrets
 import threading
 from collections.abc import Callable, Sequence
+from contextlib import suppress
 from dataclasses import dataclass, field
 from hashlib import blake2s
 
 from swarm.bus.bus import Appeared, AskEnded, Bus, Disappeared, Event, Heard, Post, Replied
 from swarm.clock import NS_PER_S, MonotonicClock
-from swarm.errors import BusError, ConfigError
+from swarm.errors import BusError, ConfigError, SwarmError
 from swarm.grid import GridSpec
 from swarm.peers import Peer
 from swarm.right_of_way.external_vehicle import Answers, ExternalVehicle, Removal, SaveGenerations
@@ -313,15 +314,17 @@ class ExternalSession:
     def stands(self, cell: int) -> bool:
         """The vehicle is in a cell: those behind it are given back. Returns whether it was let in there.
 
-        The first cell is requested, and waited for: another vehicle may be there.
+        Until it holds a cell, the one in which it stands is requested; the first is waited for, as another vehicle
+        may be there.
         """
-        if not self._entered:
-            self._entered = True
-            return self.enter(cell, _ENTER_S)
-        held = self.cells
-        for behind in held[: held.index(cell)] if cell in held else ():
-            self.left(behind)
-        return cell in held
+        with self._changed:
+            held = self.cells
+            if not held:
+                waits_s, self._entered = None if self._entered else _ENTER_S, True
+                return self.enter(cell, waits_s) and cell in self.cells
+            for behind in held[: held.index(cell)] if cell in held else ():
+                self.left(behind)
+            return cell in held
 
     def leave(self, timeout_s: float | None = _LEAVE_S) -> bool:
         """The vehicle stands on no cell any more. Returns whether that is known where it counts, so that others may
@@ -331,9 +334,10 @@ class ExternalSession:
         return self._wait(lambda: self._service.external is None or self._service.external.gone, timeout_s)
 
     def close(self) -> None:
-        """Leaves, and ends the session."""
+        """Leaves, and ends the session; also after its thread has failed, of which `may_enter` and `leave` tell."""
         if not self._closed.is_set():
-            self.leave()
+            with suppress(SwarmError):  # what else the program has is left and closed all the same
+                self.leave()
             with self._changed:
                 self._closed.set()
                 self._service.stop()
@@ -367,6 +371,7 @@ class ExternalSession:
                         self._service.tick(now_ns)
                     self._changed.notify_all()
         except BaseException as error:
+            log.error("right of way of %s has ended: %s", self._service.name, error)
             with self._changed:
                 self._failure = error
                 self._changed.notify_all()

@@ -1,12 +1,14 @@
 """An external vehicle's side of right of way, and the bounds that leaders set to external vehicles."""
 
 from pathlib import Path
+from unittest.mock import MagicMock
 
 import pytest
 
-from swarm.errors import ConfigError, DamagedError, StoreError
+from swarm.errors import BusError, ConfigError, DamagedError, StoreError
 from swarm.grid import GridSpec
-from swarm.right_of_way.external_session import ExternalService
+from swarm.right_of_way import external_session
+from swarm.right_of_way.external_session import ExternalService, ExternalSession
 from swarm.right_of_way.external_vehicle import ExternalVehicle, Removal
 from swarm.right_of_way.generations import GenerationFile, MemoryGenerations
 from swarm.right_of_way.shards import Shards
@@ -86,6 +88,25 @@ def test_what_a_driver_says_wrong_is_one_sentence() -> None:
 def test_a_name_that_cannot_be_a_part_of_a_key_is_refused() -> None:
     with pytest.raises(ConfigError, match="external vehicle 'my rover-00'"):
         ExternalService("my rover", GRID, 1, MemoryGenerations(), None, print, print)  # type: ignore[arg-type]
+
+
+def test_who_drives_on_before_it_is_let_in_asks_for_where_it_stands(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(external_session, "_ENTER_S", 0.01)
+    bus, file = MagicMock(proves_names=False), MagicMock(generations=[])
+    with ExternalSession("rover", GRID, bus, file) as session:
+        for cell in (70, 71):
+            assert not session.stands(cell)
+            assert session._service._cell == cell
+
+
+def test_a_session_whose_thread_has_failed_says_so_and_is_closed_all_the_same() -> None:
+    bus, file = MagicMock(proves_names=False), MagicMock(generations=[])
+    session = ExternalSession("rover", GRID, bus, file)
+    session._inbox.fail(StoreError("the disk is full"))
+    with pytest.raises(BusError, match="right of way has ended: the disk is full"):
+        session.may_enter(70, timeout_s=5.0)
+    session.close()
+    assert (bus.close.called, file.close.called) == (True, True)
 
 
 def test_a_host_may_speak_for_vehicles_of_its_own_name_only() -> None:
