@@ -69,8 +69,9 @@ _RESERVE_NS = NS_PER_S
 _SILENT_AGAIN_NS = 60 * NS_PER_S
 _SLOW_FOR_NS = 5 * NS_PER_S
 """A link is reported once it has been slow for this time: at a start all are, for a moment."""
-_WAITING_AGAIN_NS = 10 * NS_PER_S
-"""Interval of repeated events: a late watcher receives them, and the log stays readable."""
+_WAITING_AGAIN_NS = 30 * NS_PER_S
+"""Interval of repeated events of a shard, also if it was led meanwhile, as on a busy machine. Late watchers receive
+them, and the log stays readable."""
 
 
 @dataclass
@@ -102,7 +103,7 @@ class RightOfWaySync:
     """Agent -> number of its newest revoked certificate."""
     _refused: set[str] = field(default_factory=set)
     _unled_due_ns: dict[int, int] = field(default_factory=dict)
-    """Shard without a leader -> when that is said again."""
+    """Shard which had no leader -> from when on that is said again."""
     _reserve_due_ns: int = 0
     _slow_due_ns: int = 0
     _told_silent_ns: int | None = None
@@ -214,10 +215,8 @@ class RightOfWaySync:
         self._take_standings(now_ns)
         self._perform(self.core.tick(wishes, own_ns))
         self._tell_slow(now_ns)
-        unled = self.core.host.unled(own_ns)
-        self._unled_due_ns = {shard: self._unled_due_ns.get(shard, now_ns) for shard in unled}
-        for shard, text in unled.items():
-            if now_ns >= self._unled_due_ns[shard]:
+        for shard, text in self.core.host.unled(own_ns).items():
+            if now_ns >= self._unled_due_ns.get(shard, now_ns):
                 self._unled_due_ns[shard] = now_ns + _WAITING_AGAIN_NS
                 self.warn("waiting", text)
 

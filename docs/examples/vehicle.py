@@ -7,6 +7,7 @@ from swarm.client import connect
 with connect("tcp/127.0.0.1:7447") as swarm, swarm.vehicle("rover", radius_m=5.0) as rover:
     x_m, y_m = swarm.frame.centre_m(swarm.frame.grid.cell(row=40, col=60))  # here comes your GPS
     rover.at(x_m, y_m)
+    rover.on_route(lambda route: print(f"{route.status}: {route.cost_s:.0f} s to drive"))
     routes = rover.follow("t0")
     route = routes.next(timeout_s=10.0)
     if route is None:

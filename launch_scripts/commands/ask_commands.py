@@ -36,7 +36,7 @@ def route(
 ) -> None:
     """Find the cheapest route to a target or a place of a running swarm, or on a terrain file.
 
-    swarm route --from cell:40,200 --to 36.41,-84.29
+    swarm route --from cell:40,200 --to 36.50,-84.29
 
     swarm route --target t3 --from cell:40,200
 

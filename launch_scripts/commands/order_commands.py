@@ -142,7 +142,7 @@ def list_orders(where: Where, as_json: AsJson = False) -> None:
 def add(id: Id, at: At, where: Where, walk: str = "waypoints", speed: float = 4.0, as_json: AsJson = False) -> int:
     """Add a target. A launcher starts its planner; groups that may chase every target chase it.
 
-    swarm order target add x --at 36.41,-84.29 --walk evade
+    swarm order target add x --at 36.50,-84.29 --walk evade
 
     swarm order target add x --at cell:40,200
 

@@ -24,6 +24,7 @@ from launch_scripts.commands.shared_options import AsJson, RunOption, network_of
 from launch_scripts.plain_text import plain
 from launch_scripts.stop_requests import stop_requests
 from launch_scripts.typer_commands import RUN, command, complete_runs
+from swarm.config.explain import choice
 from swarm.errors import ConfigError, StoreError, SwarmError
 from swarm.files import check_writable, make_folder
 
@@ -147,7 +148,9 @@ def logs(
     found = _chosen(run)
     names = sorted({file.name.partition(".log")[0] for file in _log_files(found.folder)})
     if process is not None and process not in names:
-        raise ConfigError(f"run {found.name} has no log of {process!r}; it has {', '.join(names) or 'none'}")
+        raise ConfigError(
+            f"run {found.name} has no log of {process!r}{choice(process, names or ['none'], ' it has ')}"
+        )
     width, read = max(map(len, names), default=0), dict[int, int]()
     told: Iterable[_Line] = _new_lines(found.folder, process, read)
     told = told if lines is None else deque(told, maxlen=lines)
@@ -202,8 +205,8 @@ def kill(process: Annotated[str, typer.Argument(metavar="ROLE-ID")], run: RunOpt
     running = found.processes()
     again = "its launcher starts it again" if found.launchers else "it had no launcher any more"
     if process not in running:
-        has = ", ".join(sorted(running)) or "none"
-        raise ConfigError(f"run {found.name} has no process {process!r} on this machine; it has {has}")
+        has = choice(process, sorted(running) or ["none"], " it has ")
+        raise ConfigError(f"run {found.name} has no process {process!r} on this machine{has}")
     try:
         psutil.Process(running[process]).kill()
     except psutil.NoSuchProcess:

@@ -115,7 +115,7 @@ def print_status(status: Status, console: Console) -> None:
 
     first, state, frame = status.members[0], status.state, status.frame
     if not first.run_id:
-        say("no run yet: only routers answer")
+        say("only routers answer, no process of a run")
     else:
         say(f"run {first.run_id}, scenario {first.scenario}, {first.rows} x {first.cols} cells")
         say(facts.fact("elapsed_s").labelled(state))
@@ -124,7 +124,8 @@ def print_status(status: Status, console: Console) -> None:
         for line in facts.lines(state):
             say(line)
     if silent := status.silent:
-        say(unanswered(silent, len(silent) + len(status.members), _MOST_S), "yellow")
+        told = unanswered(silent, len(silent) + len(status.members), _MOST_S)
+        say(f"{told}; this machine or the network may be too busy: ask again", "yellow")
     console.print(_processes(status))
     newest = max(info.wire_version for info in status.members)
     if older := [info for info in status.members if info.wire_version < newest]:

@@ -100,7 +100,7 @@ def add(
     They enter where cells are free, and chase their group's targets. Ctrl-C takes them off the map. If the
     process is killed they stay where they are; the same command finds them again.
 
-    swarm order vehicle add my.toml --id extra --group all --count 5 --at 36.41,-84.29
+    swarm order vehicle add my.toml --id extra --group all --count 5 --at 36.50,-84.29
 
     id     Name of the agent that hosts them.
     group  The group of the scenario to which they belong.

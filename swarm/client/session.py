@@ -16,6 +16,7 @@ from swarm.bus.bus import AskEnded, Bus, Event, LinkChanged, Post, Replied
 from swarm.client.route import Route
 from swarm.client.terrain_frame import Frame, number
 from swarm.clock import NS_PER_S, Clock
+from swarm.config.explain import choice
 from swarm.errors import BusError, ConfigError, ProtocolError, RunMismatchError, SwarmError
 from swarm.wire.codec import M, decode, encode
 from swarm.wire.fields import check_id
@@ -196,7 +197,9 @@ class Session:
                 reply: RouteReply = done.result()[0]
                 found.set_result(Route.of(self.frame, reply.routes[0], reply))
             except SwarmError as error:
-                found.set_exception(BusError(f"no route to {target!r}: {error}"))
+                known = [name.removeprefix("planner-") for name in self.run.crew if name.startswith("planner-")]
+                there = "" if target in known else choice(target, known, " the scenario has ")
+                found.set_exception(BusError(f"no route to {target!r}: {error}{there}"))
             except (ValueError, IndexError) as error:
                 found.set_exception(BusError(f"the planner of {target!r} answers nonsense: {error}"))
 

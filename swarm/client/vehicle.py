@@ -160,7 +160,8 @@ class Vehicle(Reported):
     ) -> None:
         session.check_ids(id=id, group=group, vehicle_class=vehicle_class)
         if agent_of(id) != id:
-            raise session.refused(f"id {id!r} has a '-', by which the swarm names vehicles of its own agents")
+            text = f"id {id!r} has a '-', by which the swarm names vehicles of its own agents"
+            raise session.refused(f"{text}: write {id.replace('-', '_')!r}")
         self.group = group
         self.radius_m = session.number("radius_m", radius_m, 0, MOST_RADIUS_M)
         self.vehicle_class = vehicle_class

@@ -104,7 +104,7 @@ class Host(Holdings):
             if now_ns - heard_ns > _UNLED_NS and (vehicles := views[shard].seen):
                 members = self.shards.members(shard)
                 found[shard] = (
-                    f"{len(vehicles)} of our vehicles wait to enter cells: no agent leads the right of way there "
-                    f"(shard {shard}) until {self.shards.majority} of {', '.join(members)} reach each other and us"
+                    f"{len(vehicles)} vehicles of this agent wait: the agents which grant the next cells "
+                    f"({', '.join(members)}) do not answer, or too late; {self.shards.majority} of them must"
                 )
         return found

@@ -84,7 +84,7 @@ def test_vehicles_that_wait_because_two_of_three_members_are_gone_say_why_and_dr
     simulation.run_until(9)
     notes = [note for _, note in simulation.recorder.notes if note.kind == "waiting"]
     assert [note.id for note in notes] == ["a2"]
-    assert "no agent leads the right of way there (shard 0)" in notes[0].text
+    assert "agents which grant the next cells (a0, a2, a1) do not answer" in notes[0].text
     before = cells(simulation)
     simulation.nodes["agent-a0"].boot()
     simulation.run_until(14)
