@@ -128,7 +128,8 @@ def _show(made: Plan, kit: KitName) -> None:
         table.add_row(Text(label, "dim"), *(Text(text or "-") for text in texts))
     console = Console(highlight=False)
     console.print(table)
-    without = f"continues without any {made.survive} of its {number_of(len(made.hosts), 'machine')}"
+    machines = number_of(len(made.hosts), "machine")
+    without = f"continues without any {made.survive} of its {machines}, of which the vehicles then stand"
     what = f"the run {without if made.survive else 'needs every machine'}"
     console.print(f"run {made.run_id}: {number_of(len(made.processes), 'process')}; {what}", soft_wrap=True)
     if kit == "systemd":
