@@ -8,22 +8,22 @@ from __future__ import annotations
 
 import logging
 import time
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable
 from pathlib import Path
 
 from launch_scripts.gateways.ros2.gateway_settings import IncomingSettings, Settings
 from launch_scripts.gateways.ros2.incoming.dispatch import Incoming
 from launch_scripts.gateways.ros2.map_messages import MapFeed
-from launch_scripts.gateways.ros2.outgoing import Channel, Gateway, Health, Put, ToWgs84
+from launch_scripts.gateways.ros2.outgoing import Channel, Gateway, Health, ToWgs84
 from launch_scripts.gateways.ros2.rmw import Endpoint, PeerWatch
-from launch_scripts.gateways.ros2.ros_messages import RosMap
+from launch_scripts.gateways.ros2.ros_messages import RosMap, RosMessages
 from launch_scripts.gateways.ros2.ros_node import Node, Publisher, open_ros
 from launch_scripts.gateways.ros2.ros_types import types_of
 from launch_scripts.gateways.ros2.topic_table import ROWS
 from shared_map.terrain.store import find_prepared
 from swarm.client import Frame, Observer, Swarm, SwarmError
-from swarm.errors import BusError, ConfigError
+from swarm.errors import ConfigError
 
 log = logging.getLogger(__name__)
 
@@ -82,7 +82,7 @@ class _Run:
         self, settings: Settings, node: Node, swarm: Swarm, observer: Observer, runs: Path, say: Say
     ) -> None:
         side, grid = settings.ros, swarm.frame.grid
-        map = RosMap(grid, settings.frames.map)
+        messages = RosMessages(node.types, RosMap(grid, settings.frames.map))
         forwards = {row.name for row in settings.rows()}
         folder = Path(settings.swarm.terrain) if settings.swarm.terrain else None
         terrain = find_prepared(swarm.run.terrain, folder, runs)
@@ -93,12 +93,11 @@ class _Run:
             )
         to_wgs84 = _to_wgs84(swarm.frame, say) if "fix" in forwards else None
         self._swarm, self._observer, self._say = swarm, observer, say
-        self._gateway = Gateway(settings, node.types, map, MapFeed(grid, terrain), to_wgs84)
+        self._gateway = Gateway(settings, messages, MapFeed(grid, terrain), to_wgs84)
         self._node = node
         self._incoming: Incoming | None = None
         self._publishers: dict[Channel, Publisher] = {}
         self._declared: frozenset[Channel] = frozenset()
-        self._counts: Counter[str] = Counter()
         self._up = {"swarm": True, "ROS": True}
         self._watch = PeerWatch()
         self._seen: deque[Endpoint] = deque(maxlen=_MOST_SEEN)
@@ -109,7 +108,7 @@ class _Run:
         )
         if settings.incoming != IncomingSettings():
             map_now = (lambda: self._gateway.whole_map(time.time_ns())) if "map" in forwards else None
-            self._incoming = Incoming(self._node, swarm, settings.incoming, map, map_now, lambda: observer.vehicles)
+            self._incoming = Incoming(node, swarm, settings.incoming, messages, map_now, lambda: observer.vehicles)
 
     def turn(self) -> None:
         """Performs due work. Nothing here waits for ROS."""
@@ -122,7 +121,7 @@ class _Run:
         puts = self._gateway.tick(now_ns, stamp_ns, swarm_now_ns, self._observer, self._health(), robots)
         self._declare(self._gateway.channels)
         for put in puts:
-            self._put(put)
+            self._publishers[put.channel].put(put.message)
         if self._incoming is not None:
             self._incoming.tick(time.monotonic_ns())
         problems = self._gateway.take_problems()
@@ -145,19 +144,10 @@ class _Run:
         for channel in self._publishers.keys() - channels:
             self._node.remove(self._publishers.pop(channel).endpoint)
         for channel in channels - self._publishers.keys():
-            row = ROWS[channel.row]
-            self._publishers[channel] = self._node.publisher(channel.topic, row.type_name, row.qos)
-
-    def _put(self, put: Put) -> None:
-        try:
-            self._publishers[put.channel].put(put.message)
-            self._counts["put"] += 1
-        except BusError as error:
-            self._counts["put_failed"] += 1
-            log.debug("%s: %s", put.channel.topic, error)
+            self._publishers[channel] = self._node.publisher(channel.topic, ROWS[channel.row])
 
     def _health(self) -> Health:
-        counts = {**self._counts, **self._node.counts}
+        counts = {**self._node.counts}
         counts |= {f"swarm_{name}": count for name, count in self._swarm.counts.items()}
         if self._incoming is not None:
             counts |= {f"from_ros_{name}": count for name, count in self._incoming.counts.items()}

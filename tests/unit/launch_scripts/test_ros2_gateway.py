@@ -71,7 +71,8 @@ def vehicle(
 
 
 def gateway(text: str = "", types: RosTypes = TYPES) -> Gateway:
-    return Gateway(parse_settings(text), types, RosMap(GRID), MapFeed(GRID, None), lambda x, y: (48.0, 9.0))
+    messages = RosMessages(types, RosMap(GRID))
+    return Gateway(parse_settings(text), messages, MapFeed(GRID, None), lambda x, y: (48.0, 9.0))
 
 
 def told(gateway: Gateway, world: World, at_s: float, stamp_s: float | None = None) -> list[Put]:
