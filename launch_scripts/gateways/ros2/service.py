@@ -10,6 +10,7 @@ import logging
 import time
 from collections import deque
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 
 from launch_scripts.gateways.ros2.gateway_settings import IncomingSettings, Settings
@@ -52,13 +53,10 @@ def serve(
         while swarm is not None:
             with swarm, swarm.observer(every_s=_POSITIONS_S) as observer:
                 node = Node(ros, settings.ros.node, types_of(settings.ros.distribution), settings.ros.domain)
-                run = _Run(settings, node, swarm, observer, runs, say)
-                try:
+                with closing(_Run(settings, node, swarm, observer, runs, say)) as run:
                     while not stopping() and swarm.ended is None:
                         run.turn()
                         time.sleep(TICK_S)
-                finally:
-                    run.close()
                 ended = swarm.ended
             if ended is not None:
                 say(f"{ended}")
@@ -95,7 +93,6 @@ class _Run:
         self._swarm, self._observer, self._say = swarm, observer, say
         self._gateway = Gateway(settings, messages, MapFeed(grid, terrain), to_wgs84)
         self._node = node
-        self._incoming: Incoming | None = None
         self._publishers: dict[Channel, Publisher] = {}
         self._declared: frozenset[Channel] = frozenset()
         self._up = {"swarm": True, "ROS": True}
@@ -106,9 +103,9 @@ class _Run:
             f"node /{side.node} in domain {side.domain} at {side.endpoint}, {side.distribution}; "
             f"run {swarm.run_id}, scenario {swarm.scenario}"
         )
-        if settings.incoming != IncomingSettings():
-            map_now = (lambda: self._gateway.whole_map(time.time_ns())) if "map" in forwards else None
-            self._incoming = Incoming(node, swarm, settings.incoming, messages, map_now, lambda: observer.vehicles)
+        serves_map = "map" in forwards and settings.incoming != IncomingSettings()
+        map_now = (lambda: self._gateway.whole_map(time.time_ns())) if serves_map else None
+        self._incoming = Incoming(node, swarm, settings.incoming, messages, map_now, lambda: observer.vehicles)
 
     def turn(self) -> None:
         """Performs due work. Nothing here waits for ROS."""
@@ -116,14 +113,12 @@ class _Run:
             if up != self._up[side]:
                 self._up[side] = up
                 self._say(f"the {side} router {'is back' if up else 'is disconnected: waiting for it'}")
-        robots = () if self._incoming is None else self._incoming.robots
-        now_ns, stamp_ns, swarm_now_ns = time.monotonic_ns(), time.time_ns(), self._swarm.now_ns
-        puts = self._gateway.tick(now_ns, stamp_ns, swarm_now_ns, self._observer, self._health(), robots)
+        clocks = time.monotonic_ns(), time.time_ns(), self._swarm.now_ns
+        puts = self._gateway.tick(*clocks, self._observer, self._health(), self._incoming.robots)
         self._declare(self._gateway.channels)
         for put in puts:
             self._publishers[put.channel].put(put.message)
-        if self._incoming is not None:
-            self._incoming.tick(time.monotonic_ns())
+        self._incoming.tick(time.monotonic_ns())
         problems = self._gateway.take_problems()
         while self._seen:
             problems += self._watch.sentences(self._seen.popleft(), self._node.endpoints)
@@ -132,8 +127,7 @@ class _Run:
 
     def close(self) -> None:
         """Takes back all that was declared."""
-        if self._incoming is not None:
-            self._incoming.close()
+        self._incoming.close()
         self._node.close()
 
     def _declare(self, channels: frozenset[Channel]) -> None:
@@ -148,9 +142,8 @@ class _Run:
 
     def _health(self) -> Health:
         counts = {**self._node.counts}
-        counts |= {f"swarm_{name}": count for name, count in self._swarm.counts.items()}
-        if self._incoming is not None:
-            counts |= {f"from_ros_{name}": count for name, count in self._incoming.counts.items()}
+        for side, counted in (("swarm", self._swarm.counts), ("from_ros", self._incoming.counts)):
+            counts |= {f"{side}_{name}": count for name, count in counted.items()}
         return Health(self._swarm.run_id, self._up["swarm"], self._up["ROS"], counts)
 
 
