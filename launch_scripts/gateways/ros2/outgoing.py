@@ -38,6 +38,7 @@ _STANDS_NS = NS_PER_S // 2
 """A vehicle without another position for this time is at rest."""
 _BAD_STATES = ("stranded", "lost")
 ToWgs84 = Callable[[float, float], tuple[float, float]]
+Say = Callable[[str], None]
 
 
 class Channel(Struct, frozen=True):
@@ -136,23 +137,22 @@ class Gateway:
     settings  forwarded topics, and their types
     messages  in the frame of published positions
     feed      the shared map
+    say       receives sentences for people
     to_wgs84  (latitude, longitude) of a place of the terrain; None where there are none
     """
 
     def __init__(
-        self, settings: Settings, messages: RosMessages, feed: MapFeed, to_wgs84: ToWgs84 | None = None
+        self, settings: Settings, messages: RosMessages, feed: MapFeed, say: Say, to_wgs84: ToWgs84 | None = None
     ) -> None:
         self._rows = {row.name: row for row in settings.rows() if to_wgs84 is not None or row.name != "fix"}
         self._bare, self._patterns = settings.frames.bare, settings.vehicles
-        self._feed = feed
-        self._messages = messages
+        self._messages, self._feed, self._say = messages, feed, say
         self._vehicles: dict[str, Moving] = {}
         """By name in ROS."""
         self._targets: dict[str, str] = {}
         """Name in ROS -> id."""
         self._refused: set[str] = set()
         """Vehicles and targets that are not published; each is reported once."""
-        self._problems: list[str] = []
         self._crew_changed = False
         """Vehicles have come or gone since /tf_static was put."""
         self._transforms: dict[str | None, PackedPlaces] = {}
@@ -182,11 +182,6 @@ class Gateway:
     def whole_map(self, stamp_ns: int) -> Any:
         """nav_msgs/OccupancyGrid of the map as it is known now."""
         return map_messages.occupancy_grid(self._messages, stamp_ns, self._feed.occupancy(self._feed.grid.window))
-
-    def take_problems(self) -> list[str]:
-        """Sentences for people since the last call."""
-        taken, self._problems = self._problems, []
-        return taken
 
     def tick(
         self,
@@ -266,7 +261,7 @@ class Gateway:
     def _refuse(self, who: str, why: str) -> None:
         if who not in self._refused and len(self._refused) < MOST_VEHICLES:
             self._refused.add(who)
-            self._problems.append(f"{who} is not published to ROS: {why}")
+            self._say(f"{who} is not published to ROS: {why}")
 
     def _channels_now(self) -> frozenset[Channel]:
         names: dict[str | None, Iterable[str | None]] = {

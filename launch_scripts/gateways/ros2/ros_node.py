@@ -12,7 +12,7 @@ import time
 from collections import Counter, deque
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from typing import Any
 
 import zenoh
@@ -70,7 +70,9 @@ class Node:
         self._session = session
         self._numbers = itertools.count(1)
         self._declared: dict[Endpoint, list[Any]] = {}
-        self._own: list[Any] = [session.liveliness().declare_token(self.name.token)]
+        self._own = ExitStack()
+        """Takes back the node's token, and what it watches."""
+        self._own.callback(session.liveliness().declare_token(self.name.token).undeclare)
         self._lock = threading.Lock()
 
     @property
@@ -174,9 +176,8 @@ class Node:
                 seen(endpoint, sample.kind == zenoh.SampleKind.PUT)
 
         # No `get` of tokens: beside a subscription it blocks for ever beyond 256 of them. History brings all.
-        self._own.append(
-            self._session.liveliness().declare_subscriber(f"@ros2_lv/{domain}/**", Callback(take), history=True)
-        )
+        tokens, key = self._session.liveliness(), f"{rmw.TOKEN_SPACE}/{domain}/**"
+        self._own.callback(tokens.declare_subscriber(key, Callback(take), history=True).undeclare)
 
     def remove(self, endpoint: Endpoint) -> None:
         """Takes an endpoint back. Its last message is not repeated to late subscribers any more."""
@@ -189,9 +190,7 @@ class Node:
         """Takes back all, as `remove` does. The session stays open."""
         for endpoint in list(self._declared):
             self.remove(endpoint)
-        for each in self._own:
-            each.undeclare()
-        self._own = []
+        self._own.close()
 
     def _endpoint(self, kind: Kind, topic: str, row: TopicRow) -> Endpoint:
         type_hash = self.types.hash_of(row.type_name)

@@ -16,7 +16,7 @@ from pathlib import Path
 from launch_scripts.gateways.ros2.gateway_settings import IncomingSettings, Settings
 from launch_scripts.gateways.ros2.incoming.dispatch import Incoming
 from launch_scripts.gateways.ros2.map_messages import MapFeed
-from launch_scripts.gateways.ros2.outgoing import Channel, Gateway, Health, ToWgs84
+from launch_scripts.gateways.ros2.outgoing import Channel, Gateway, Health, Say, ToWgs84
 from launch_scripts.gateways.ros2.rmw import Endpoint, PeerWatch
 from launch_scripts.gateways.ros2.ros_messages import RosMap, RosMessages
 from launch_scripts.gateways.ros2.ros_node import Node, Publisher, open_ros
@@ -35,7 +35,6 @@ _MOST_SEEN = 4096
 _POSITIONS_S = 0.1
 """Ten samples a second, as often as vehicles tell where they are by default (docs/design/ros2-gateway.md): a
 position is a tenth of a second old at most."""
-Say = Callable[[str], None]
 
 
 def serve(
@@ -91,7 +90,7 @@ class _Run:
             )
         to_wgs84 = _to_wgs84(swarm.frame, say) if "fix" in forwards else None
         self._swarm, self._observer, self._say = swarm, observer, say
-        self._gateway = Gateway(settings, messages, MapFeed(grid, terrain), to_wgs84)
+        self._gateway = Gateway(settings, messages, MapFeed(grid, terrain), say, to_wgs84)
         self._node = node
         self._publishers: dict[Channel, Publisher] = {}
         self._declared: frozenset[Channel] = frozenset()
@@ -119,11 +118,9 @@ class _Run:
         for put in puts:
             self._publishers[put.channel].put(put.message)
         self._incoming.tick(time.monotonic_ns())
-        problems = self._gateway.take_problems()
         while self._seen:
-            problems += self._watch.sentences(self._seen.popleft(), self._node.endpoints)
-        for sentence in problems:
-            self._say(sentence)
+            for sentence in self._watch.sentences(self._seen.popleft(), self._node.endpoints):
+                self._say(sentence)
 
     def close(self) -> None:
         """Takes back all that was declared."""

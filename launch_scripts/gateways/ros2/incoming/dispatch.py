@@ -63,7 +63,8 @@ class Incoming:
         self._routes = WorkQueue("ros2-routes", ROUTE_THREADS, MOST_ASKED)
         self._orders = WorkQueue("ros2-orders", 1, _MOST_ORDERS)
         """An order waits until it is obeyed, and the next one for it."""
-        self._robots: dict[str, Robot] = {}
+        self.robots: dict[str, Robot] = {}
+        """By id: those that are known, vehicles by now or not."""
         self._publishers: Counter[str] = Counter()
         """Topic of a robot -> how many publish it, as their tokens say."""
         self._news: deque[tuple[Endpoint, bool]] = deque(maxlen=_MOST_NEWS)
@@ -95,14 +96,9 @@ class Incoming:
             node.watch(str(node.name.domain), lambda seen, there: self._news.append((seen, there)))
 
     @property
-    def robots(self) -> frozenset[str]:
-        """Ids of those that are known, vehicles by now or not."""
-        return frozenset(self._robots)
-
-    @property
     def counts(self) -> Mapping[str, int]:
         """Returns the number of robots that are vehicles now, and counts of refused messages of known robots."""
-        robots = self._robots.values()
+        robots = self.robots.values()
         return {"robots": sum(each.present for each in robots), "refused": sum(each.refused for each in robots)}
 
     def tick(self, now_ns: int) -> None:
@@ -110,7 +106,7 @@ class Incoming:
 
         now_ns  by time.monotonic_ns
         """
-        if (self._robots or self._settings.orders) and now_ns >= self._taken_due_ns:
+        if (self.robots or self._settings.orders) and now_ns >= self._taken_due_ns:
             self._taken_due_ns = now_ns + _LOOK_NS
             taken = {ros_name(id): id for id in self._vehicles() if agent_of(id) != id}
             self._taken = frozenset(taken)
@@ -119,7 +115,7 @@ class Incoming:
                 self._inputs.append(self._goal_input(name, taken[name]))
         for _ in range(len(self._news)):
             self._on_endpoint(*self._news.popleft())
-        for robot in self._robots.values():
+        for robot in self.robots.values():
             robot.tick(now_ns)
         for each in self._inputs:
             each.tick(now_ns)
@@ -152,20 +148,20 @@ class Incoming:
                     self._warn(id, f"it publishes {seen.topic} as {hash}, expected {ours[:20]} (--distribution)")
                 continue
             self._publishers[seen.topic] += 1 if there else -1
-            known = self._robots.get(id)
+            known = self.robots.get(id)
             if self._publishers[seen.topic] > 0 and known is None:
                 self._add(id, robots)
             elif self._publishers[seen.topic] <= 0:
                 del self._publishers[seen.topic]
                 if known is not None and known.topic == seen.topic:
-                    self._robots.pop(id).close()
+                    self.robots.pop(id).close()
             return
 
     def _add(self, id: str, robots: Robots) -> None:
-        if len(self._robots) >= MOST_ROBOTS:
+        if len(self.robots) >= MOST_ROBOTS:
             self._warn(id, f"there are {MOST_ROBOTS} already")
             return
-        self._robots[id] = Robot(
+        self.robots[id] = Robot(
             id, robots, self._node, self._swarm, self._routes, self._messages, lambda name: name in self._taken
         )
 
