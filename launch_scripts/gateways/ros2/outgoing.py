@@ -63,14 +63,13 @@ class Put(Struct, frozen=True):
 class Health:
     """State of the gateway's two sides, as the shell knows it.
 
-    run         id of the run
-    swarm_up, ros_up  whether the links to the routers are up
-    counts      messages published, dropped and refused since the start
+    run     id of the run
+    up      whether the links to both routers are up
+    counts  messages published, dropped and refused since the start
     """
 
     run: str = ""
-    swarm_up: bool = True
-    ros_up: bool = True
+    up: bool = True
     counts: Mapping[str, int] = field(default_factory=dict)
 
 
@@ -364,7 +363,6 @@ class Gateway:
         captures = sum(each.captures for each in now.targets.values())
         grid, health, knows = self._feed.grid, now.health, self._feed.knows_ground
         west_m, south_m = self._messages.map.origin_m
-        up = health.swarm_up and health.ros_up
         vehicles = bad or f"{len(now.vehicles)} vehicles"
         nothing = "marks alone: the terrain of the run is not on this machine"
         rows: tuple[tuple[str, Level, str, Mapping[str, object]], ...] = (
@@ -376,7 +374,8 @@ class Gateway:
             ("map", Level.OK if knows else Level.WARN, "ground and marks" if knows else nothing,
              {"crs": grid.crs, "origin_x_m": west_m, "origin_y_m": south_m, "rows": grid.rows, "cols": grid.cols,
               "resolution_m": grid.resolution_m}),
-            ("gateway", Level.OK if up else Level.ERROR, "both links are up" if up else "a link is down",
+            ("gateway", Level.OK if health.up else Level.ERROR,
+             "both links are up" if health.up else "a link is down",
              {"run": health.run, **dict(sorted(health.counts.items()))}),
         )  # fmt: skip
         told = [self._messages.diagnostic(f"swarm: {row[0]}", *row[1:]) for row in rows]

@@ -141,7 +141,7 @@ class _Run:
         counts = {**self._node.counts}
         for side, counted in (("swarm", self._swarm.counts), ("from_ros", self._incoming.counts)):
             counts |= {f"{side}_{name}": count for name, count in counted.items()}
-        return Health(self._swarm.run_id, self._up["swarm"], self._up["ROS"], counts)
+        return Health(self._swarm.run_id, all(self._up.values()), counts)
 
 
 def _to_wgs84(frame: Frame, say: Say) -> ToWgs84 | None:
