@@ -26,7 +26,6 @@ from launch_scripts.gateways.ros2.gateway_settings import Settings
 from launch_scripts.typer_commands import Family
 from shared_map.importers.cover.land_cover import TABLES
 from shared_map.importers.zones.zone_features import BUILT_IN, COLUMNS
-from swarm.config.explain import meanings
 
 _REFERENCE = Path(__file__).parents[1] / "reference"
 _DESIGN = Path(__file__).parents[1] / "design"
@@ -83,7 +82,7 @@ def _rows(command: Any) -> list[tuple[str, str, str]]:
 def ros2() -> str:
     """Returns the page of what `swarm gateway ros2` forwards and of its settings."""
     settings = scenario_page.settings(Settings)
-    return filled("ros2", table=topic_table, says=meanings(topic_table), qos=_QOS, settings=settings)
+    return filled("ros2", table=topic_table, qos=_QOS, settings=settings)
 
 
 def design() -> str:

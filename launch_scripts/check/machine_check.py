@@ -79,14 +79,10 @@ class RunNeeds(NamedTuple):
 
 def this_machine(runs: Path) -> Resources:
     """Returns the resources of this machine, with the disk of a folder of runs."""
-    return Resources(len(os.sched_getaffinity(0)), available_bytes(), shutil.disk_usage(_nearest(runs)).free)
-
-
-def available_bytes() -> int:
-    """Memory that new processes can have."""
     import psutil
 
-    return int(psutil.virtual_memory().available)
+    free_bytes, disk_bytes = psutil.virtual_memory().available, shutil.disk_usage(_nearest(runs)).free
+    return Resources(len(os.sched_getaffinity(0)), free_bytes, disk_bytes)
 
 
 def needs_of(scenario: Scenario, cells: int) -> RunNeeds:
@@ -236,7 +232,7 @@ def _cores(runs: Path) -> Said:
 
 
 def _memory(runs: Path) -> Said:
-    free = available_bytes()
+    free = this_machine(runs).free_bytes
     if free < _ENOUGH_BYTES:
         return "warning", f"{size(free)} are free; the demo takes about 0.6 GB: end something else first"
     return "ok", f"{size(free)} are free"
@@ -266,16 +262,11 @@ def _zenoh(runs: Path) -> Said:
 
 
 def _clock(runs: Path) -> Said:
-    state = _clock_state()
+    # All zero asks and changes nothing. A state below 0: the kernel gives none.
+    state = int(ctypes.CDLL(None).adjtimex(ctypes.create_string_buffer(_TIMEX_BYTES)))
     if state == _UNSYNCHRONISED:
         return "warning", "not synchronised (no NTP), which several machines need: start chrony or ntpd"
     return "ok", "synchronised" if state >= 0 else "whether it is synchronised is not known"
-
-
-def _clock_state() -> int:
-    """Returns the kernel's state of its clock; below 0 if it gives none."""
-    # All zero asks and changes nothing.
-    return int(ctypes.CDLL(None).adjtimex(ctypes.create_string_buffer(_TIMEX_BYTES)))
 
 
 def _disk(runs: Path) -> Said:

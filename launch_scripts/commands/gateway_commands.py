@@ -156,7 +156,6 @@ def mavlink(
     """
     from launch_scripts.gateways.mavlink.guidance import Wishes
     from launch_scripts.gateways.mavlink.link import read_address
-    from launch_scripts.gateways.mavlink.mavlink_codec import pymavlink
     from launch_scripts.gateways.mavlink.service import read_key, run
 
     address = read_address(link)
@@ -177,7 +176,6 @@ def mavlink(
         raise ConfigError(f"{option} goes with --target or --to: without one nothing is driven")
     if drives.above == "terrain" and altitude is None:
         raise ConfigError("--above terrain goes with --altitude: how many metres above it")
-    pymavlink()
     network = where.network()
 
     wishes = Wishes(

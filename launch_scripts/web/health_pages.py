@@ -38,56 +38,33 @@ class Process(NamedTuple):
             return "hangs", wrong, (wrong,)
         return self.vitals.phase.name.lower(), None, self.vitals.lacks
 
-    def fields(self, now_ns: int) -> dict[str, object]:
-        """Fields of the process as JSON."""
-        state, _, lacks = self.seen(now_ns)
-        told: dict[str, object] = {"name": self.name, "state": state, "lacks": list(lacks)}
-        if self.ended is None and self.vitals is not None and self.vitals.phase is Phase.RUNS:
-            told["ticked_s_ago"] = round((now_ns - self.vitals.stamp_ns) / NS_PER_S, 3)
-        return told
 
-
-class Verdict(NamedTuple):
-    """The answer to a probe.
-
-    missing  faults and missing parts, one sentence each; empty if all is well
-    """
-
-    status: str
-    missing: tuple[str, ...]
-    processes: tuple[dict[str, object], ...]
-
-    @property
-    def ok(self) -> bool:
-        """True if all is well."""
-        return not self.missing
-
-    @property
-    def body(self) -> bytes:
-        """JSON in ASCII: what processes say of themselves is safe to print."""
-        return json.dumps(self._asdict(), indent=1).encode("ascii") + b"\n"
-
-
-def verdict(question: str, processes: Sequence[Process], now_ns: int) -> Verdict:
-    """Returns whether processes live (`/healthz`), or are ready (`/readyz`).
+def verdict(question: str, processes: Sequence[Process], now_ns: int) -> Reply:
+    """Returns whether processes live (`/healthz`), or are ready (`/readyz`): 200 if all is well, 503 otherwise. The
+    reasons are JSON in ASCII, as what processes say of themselves is to be safe to print.
 
     now_ns  on the monotonic clock of the machine
     """
     missing: list[str] = []
+    told: list[dict[str, object]] = []
     for each in processes:
-        _, wrong, lacks = each.seen(now_ns)
+        state, wrong, lacks = each.seen(now_ns)
         found = lacks if question == READY else () if wrong is None else (wrong,)
         missing += [f"{each.name}: {need}" for need in found]
+        row: dict[str, object] = {"name": each.name, "state": state, "lacks": lacks}
+        if each.ended is None and each.vitals is not None and each.vitals.phase is Phase.RUNS:
+            row["ticked_s_ago"] = round((now_ns - each.vitals.stamp_ns) / NS_PER_S, 3)
+        told.append(row)
     word = "ready" if question == READY else "healthy"
-    status = f"not {word}" if missing else word
-    return Verdict(status, tuple(missing), tuple(each.fields(now_ns) for each in processes))
+    answer = {"status": f"not {word}" if missing else word, "missing": missing, "processes": told}
+    body = json.dumps(answer, indent=1).encode("ascii") + b"\n"
+    return Reply(503 if missing else 200, "application/json", body)
 
 
 def health_pages(processes: Callable[[], Sequence[Process]]) -> dict[str, Page]:
-    """The two pages that probes ask for: 200 if all is well, 503 otherwise, with the reasons as JSON."""
+    """The two pages that probes ask for."""
 
     def answer(question: str, query: str, headers: object) -> Reply:
-        found = verdict(question, processes(), time.monotonic_ns())
-        return Reply(200 if found.ok else 503, "application/json", found.body)
+        return verdict(question, processes(), time.monotonic_ns())
 
     return {question: partial(answer, question) for question in PROBED}

@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from launch_scripts.gateways.mavlink import mavlink_codec as codec
-from launch_scripts.gateways.mavlink.adapter import Action, Adapter, Tell
+from launch_scripts.gateways.mavlink.adapter import Action, Adapter
 from launch_scripts.gateways.mavlink.arming import ARDUPILOT, PX4
 from launch_scripts.gateways.mavlink.guidance import Way, Wishes
 from swarm.client import Frame
@@ -122,4 +122,4 @@ class World:
         self.adapter.on_message(message, self.now_ns)
 
     def told(self) -> list[str]:
-        return [action.sentence for _, action in self.said if isinstance(action, Tell)]
+        return [action for _, action in self.said if isinstance(action, str)]

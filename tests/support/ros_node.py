@@ -11,6 +11,7 @@ from typing import Any
 from launch_scripts.gateways.ros2.rmw import Endpoint, NodeName, Qos
 from launch_scripts.gateways.ros2.ros_node import Input, Node
 from launch_scripts.gateways.ros2.ros_types import LARGEST_MESSAGE_BYTES, RosTypes
+from launch_scripts.gateways.ros2.topic_table import TopicRow
 
 
 class PeerNode(Node):
@@ -18,15 +19,8 @@ class PeerNode(Node):
 
     def subscribe(self, topic: str, type_name: str, hear: Callable[[Any], None], qos: Qos = Qos.DEFAULT) -> None:
         """Calls `hear` with what came last, on a thread of its own."""
-        heard = Input(
-            self,
-            topic,
-            type_name,
-            1000.0,
-            lambda message, _: hear(message),
-            qos=qos,
-            most_bytes=LARGEST_MESSAGE_BYTES,
-        )
+        row = TopicRow("heard", topic, type_name, qos, "", hz=1000.0)
+        heard = Input(self, topic, row, lambda message, _: hear(message), most_bytes=LARGEST_MESSAGE_BYTES)
 
         def read() -> None:
             while heard.endpoint in self.endpoints:
@@ -53,7 +47,7 @@ class FakeNode:
     def watch(self, domain: str, seen: Callable[[Endpoint, bool], None]) -> None:
         self.tell = seen
 
-    def listen(self, topic: str, type_name: str, qos: Qos, keep: Callable[[Any], object]) -> Any:
+    def listen(self, topic: str, row: TopicRow, keep: Callable[[Any], object]) -> Any:
         self.topics[topic] = SimpleNamespace(waiting=SimpleNamespace(append=keep))
         return SimpleNamespace(topic=topic)
 

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Sequence
 from contextlib import suppress
 
 from msgspec import Struct
@@ -49,13 +51,8 @@ class Unfollow(Struct, frozen=True):
     """The target is given up."""
 
 
-class Tell(Struct, frozen=True):
-    """A sentence for the log."""
-
-    sentence: str
-
-
-Action = codec.Outgoing | Report | Withdraw | Follow | Unfollow | Tell
+Action = codec.Outgoing | Report | Withdraw | Follow | Unfollow | str
+"""A text is a sentence for the log."""
 
 
 class Adapter:
@@ -91,7 +88,8 @@ class Adapter:
         self._tells: list[str] = []
         self._told: set[str] = set()
         """Sentences of this minute."""
-        self._beat_due_ns = self._report_due_ns = self._ask_due_ns = self._warn_due_ns = self._minute_ends_ns = 0
+        self._due_ns = Counter[str]()
+        """Time when a thing that is done once a period is due again."""
 
     # --- what comes -----------------------------------------------------------------------------------------------
 
@@ -102,8 +100,7 @@ class Adapter:
                 self._hear_beat(message, now_ns)
             case codec.Position():
                 self._hear_position(message, now_ns)
-            case codec.Warned(text=text) if now_ns >= self._warn_due_ns:
-                self._warn_due_ns = now_ns + _WARN_NS
+            case codec.Warned(text=text) if self._is_due("warning", _WARN_NS, now_ns):
                 self._tells.append(f"the vehicle says: {text}")
             case codec.CommandAnswered() if self._arming is not None:
                 self._tells += self._arming.on_command_answer(message)
@@ -127,11 +124,11 @@ class Adapter:
             self.kind = kind
             armed = "armed" if beat.armed else "disarmed"
             self._tells.append(f"found {kind.name}, MAV_TYPE {beat.type}, {armed}")
-            guide = None if self._wishes.target is None else guidance.guide_of(kind, self._frame, self._wishes)
-            if isinstance(guide, str):
-                self._tells.append(f"the vehicle is not driven: {guide}")
-            elif guide is not None:
-                self._guide, self._arming = guide, guidance.arming_of(kind, self._wishes)
+            if self._wishes.target is not None:
+                try:
+                    self._guide, self._arming = guidance.guidance_of(kind, self._frame, self._wishes)
+                except ConfigError as error:
+                    self._tells.append(f"the vehicle is not driven: {error}")
         if kind != self.kind:
             self._tells.append("another kind of vehicle speaks under the same number: it is ignored")
             return
@@ -149,50 +146,46 @@ class Adapter:
     def tick(self, now_ns: int) -> list[Action]:
         """Returns due actions, in order. To be called twenty times a second at least."""
         actions: list[Action] = []
-        if now_ns >= self._beat_due_ns:
-            self._beat_due_ns = now_ns + BEAT_NS
+        if self._is_due("heartbeat", BEAT_NS, now_ns):
             actions.append(codec.Heartbeat())
         silent = self._position_ns is None or now_ns - self._position_ns > NS_PER_S
-        if self._beat is not None and silent and now_ns >= self._ask_due_ns:
-            self._ask_due_ns = now_ns + _ASK_NS
+        if self._beat is not None and silent and self._is_due("question", _ASK_NS, now_ns):
             actions.append(codec.Command(codec.SET_MESSAGE_INTERVAL, (codec.GLOBAL_POSITION_INT, _POSITIONS_US)))
         actions += self._come_or_go(now_ns)
         if self._there:
             actions += self._report(now_ns)
             actions += self._drive(now_ns)
-        return actions + self._news(now_ns)
+            if self._arming is not None and self._arming.why:
+                self._tells.append(f"the vehicle's mode and motors are left alone from now on: {self._arming.why}")
+                self._arming = None
+        self._tells += [each for each in actions if isinstance(each, str)]
+        return [*(each for each in actions if not isinstance(each, str)), *self._news(now_ns)]
 
     def stop(self, now_ns: int) -> list[Action]:
         """Returns the final commands to the vehicle: it is to stop, as other vehicles avoid it no more."""
         self._swarm_up = False
-        return self._hold(now_ns, last=True) if self._there else []
+        return self._drive(now_ns, last=True) if self._there else []
 
-    def _drive(self, now_ns: int) -> list[Action]:
-        """Returns what lets the vehicle follow the way, or hold where there is none."""
-        if self._guide is None or self._beat is None or self._at is None:
-            return []
-        if not self._way or not self._swarm_up:
-            said = self._hold(now_ns)
-        else:
-            led = self._guide.lead(self._way, *self._at, now_ns)
-            self._tells += [each for each in led if isinstance(each, str)]
-            said = [each for each in led if not isinstance(each, str)]
-            if self._arming is not None and self._guide.ready(now_ns):
-                said += self._arming.drive(self._beat, self._at[0].height_m, now_ns)
-        if self._arming is not None and self._arming.why:
-            self._tells.append(f"the vehicle's mode and motors are left alone from now on: {self._arming.why}")
-            self._arming = None
-        return said
-
-    def _hold(self, now_ns: int, *, last: bool = False) -> list[Action]:
-        """Returns what lets the vehicle stay where it is, as far as that is ours.
+    def _drive(self, now_ns: int, *, last: bool = False) -> list[Action]:
+        """Returns what lets the vehicle follow the way, or stay where it is without one, as far as that is ours.
 
         last  nothing is said after it
         """
-        if self._guide is None or self._beat is None or self._at is None:
+        guide, arming, beat = self._guide, self._arming, self._beat
+        if guide is None or beat is None or self._at is None:
             return []
-        said: list[Action] = list(self._guide.stay(self._at[0], now_ns))
-        return said if self._arming is None else [*said, *self._arming.hold(self._beat, now_ns, last=last)]
+        position, place = self._at
+        said: Sequence[Action]
+        commands: Sequence[Action] = []
+        if self._way and self._swarm_up:
+            said = guide.lead(self._way, position, place, now_ns)
+            if arming is not None and guide.ready(now_ns):
+                commands = arming.drive(beat, position.height_m, now_ns)
+        else:
+            said = guide.stay(position, now_ns)
+            if arming is not None:
+                commands = arming.hold(beat, now_ns, last=last)
+        return [*said, *commands]
 
     def _come_or_go(self, now_ns: int) -> list[Action]:
         why = self._why_gone(now_ns)
@@ -227,26 +220,31 @@ class Adapter:
         return "" if self._at is not None else "it is outside the terrain"
 
     def _report(self, now_ns: int) -> list[Action]:
-        if self._at is None or self._at[0] is self._reported or now_ns < self._report_due_ns:
+        if self._at is None or self._at[0] is self._reported or not self._is_due("report", REPORT_NS, now_ns):
             return []
         position, place = self._at
-        self._report_due_ns = now_ns + REPORT_NS
         first, self._reported = self._reported is None, position
         actions: list[Action] = [Report(*place, position.heading_rad, _speed(position))]
         if first and self._guide is not None and self._wishes.target is not None:
             actions.append(Follow(self._wishes.target))
         return actions
 
-    def _news(self, now_ns: int) -> list[Action]:
+    def _news(self, now_ns: int) -> list[str]:
         """Returns new sentences for people, each once a minute."""
-        if now_ns >= self._minute_ends_ns:
-            self._minute_ends_ns = now_ns + _SAY_AGAIN_NS
+        if self._is_due("minute", _SAY_AGAIN_NS, now_ns):
             self._told.clear()
         new = [each for each in dict.fromkeys(self._tells) if each not in self._told]
         told = new[: _MOST_SAID - len(self._told)]
         self._told.update(told)
         self._tells.clear()
-        return [Tell(each) for each in told]
+        return told
+
+    def _is_due(self, what: str, every_ns: int, now_ns: int) -> bool:
+        """Returns True once in a period."""
+        due = now_ns >= self._due_ns[what]
+        if due:
+            self._due_ns[what] = now_ns + every_ns
+        return due
 
 
 def _speed(position: codec.Position) -> float:

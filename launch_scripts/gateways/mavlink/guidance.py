@@ -1,6 +1,6 @@
 """The guidance of a vehicle along the swarm's routes, by missions or setpoints.
 
-A guide is chosen once by `guide_of`. It takes the newest route and the vehicle's place, and returns messages.
+A guide is chosen once by `guidance_of`. It takes the newest route and the vehicle's place, and returns messages.
 Without a way that leads somewhere the vehicle holds, as far as that is ours: by setpoints it gets one where it is,
 or none any more. A mission is driven to its end, unless the vehicle's mode becomes hold.
 """
@@ -14,7 +14,7 @@ from typing import Literal
 
 from launch_scripts.gateways.mavlink import mavlink_codec as codec
 from launch_scripts.gateways.mavlink.arming import ARDUPILOT, PX4, Arming, Kind
-from swarm.client import Frame
+from swarm.client import ConfigError, Frame
 from swarm.client.route import along, between
 from swarm.client.terrain_frame import Point
 from swarm.clock import NS_PER_S
@@ -77,32 +77,25 @@ def flies(kind: Kind, altitude_m: float | None) -> bool:
     return altitude_m is not None if kind.flies is None else kind.flies
 
 
-def guide_of(kind: Kind, frame: Frame, wishes: Wishes) -> Guide | str:
-    """Returns what guides a kind of vehicle as it is wished, or why it cannot be driven: a sentence."""
-    height_m = wishes.altitude_m if flies(kind, wishes.altitude_m) else None
-    if flies(kind, wishes.altitude_m):
-        if height_m is None:
-            return "it flies without an altitude: give --altitude M, as the swarm publishes no heights"
-        if wishes.above == "terrain" and kind.make != ARDUPILOT:
-            return f"{kind.name} takes no heights above terrain: give --above home"
-    above = codec.ABOVE_TERRAIN if height_m is not None and wishes.above == "terrain" else codec.ABOVE_HOME
-    if wishes.drive == "mission":
-        return Missions(kind, frame, above, height_m)
-    if kind.modes is None or kind.modes.guided is None:
-        return f"{kind.name} has no guided mode here; give --drive mission"
-    return Setpoints(kind, frame, above, height_m)
-
-
-def arming_of(kind: Kind, wishes: Wishes) -> Arming | None:
-    """Returns the arming of a vehicle that can be driven as requested; None if another controller arms it."""
+def guidance_of(kind: Kind, frame: Frame, wishes: Wishes) -> tuple[Guide, Arming | None]:
+    """Returns what guides a kind of vehicle as it is wished, and its arming; None if another controller arms it.
+    Raises ConfigError if it cannot be driven so."""
+    aloft, guided, modes = flies(kind, wishes.altitude_m), wishes.drive == "guided", kind.modes
+    height_m = wishes.altitude_m if aloft else None
+    if aloft and height_m is None:
+        raise ConfigError("it flies without an altitude: give --altitude M, as the swarm publishes no heights")
+    above = codec.ABOVE_TERRAIN if aloft and wishes.above == "terrain" else codec.ABOVE_HOME
+    if above == codec.ABOVE_TERRAIN and kind.make != ARDUPILOT:
+        raise ConfigError(f"{kind.name} takes no heights above terrain: give --above home")
+    if guided and (modes is None or modes.guided is None):
+        raise ConfigError(f"{kind.name} has no guided mode here; give --drive mission")
+    guide = (Setpoints if guided else Missions)(kind, frame, above, height_m)
     if not wishes.arm:
-        return None
-    guided = wishes.drive == "guided"
-    mode = None if kind.modes is None else kind.modes.guided if guided else kind.modes.mission
+        return guide, None
+    mode = None if modes is None else modes.guided if guided else modes.mission
     # PX4 starts its missions by their mode, and climbs to the height of its setpoints.
-    takes_off = guided and not kind.streams and flies(kind, wishes.altitude_m)
-    takeoff_m = wishes.altitude_m if takes_off else None
-    return Arming(kind, mode, starts=kind.make != PX4 and not guided, takeoff_m=takeoff_m)
+    takeoff_m = height_m if guided and not kind.streams else None
+    return guide, Arming(kind, mode, starts=kind.make != PX4 and not guided, takeoff_m=takeoff_m)
 
 
 class _Guide:
@@ -203,14 +196,14 @@ class Missions(_Guide):
 
     def lead(self, way: Way, position: codec.Position, place: Point, now_ns: int) -> Sequence[codec.Outgoing | str]:
         """Returns the messages that make the vehicle follow a route, with sentences for people."""
-        if self._upload is None and now_ns >= self._due_ns and self._is_news(way, place):
+        upload = self._upload
+        if upload is None:
+            if now_ns < self._due_ns or not self._is_news(way, place):
+                return []
             left = rest(way, place, self._frame.grid.resolution_m)
             self._seen, self._sent, self._cut = way, left[:MOST_POINTS], len(left) > MOST_POINTS
             self._due_ns = now_ns + _NEXT_NS
-            self._upload = Upload(self._items(position))
-        upload = self._upload
-        if upload is None:
-            return []
+            upload = self._upload = Upload(self._items(position))
         said = upload.tick(now_ns)
         if not upload.accepted and not upload.why:
             return [] if said is None else [said]

@@ -7,6 +7,7 @@ seconds while a peer is missing.
 from __future__ import annotations
 
 import contextlib
+import os
 import re
 import select
 import socket
@@ -60,12 +61,7 @@ def open_link(address: Address) -> UdpLink | StreamLink:
     if address.kind == "serial":
         import serial
 
-        port: Any = serial.Serial
-        link = StreamLink(
-            lambda: port(address.name, address.number, timeout=0.02, write_timeout=0.05),
-            lambda port: port.read(port.in_waiting or 1),
-            lambda port, data: port.write(data),
-        )
+        link = StreamLink(lambda: serial.Serial(address.name, address.number))
         try:
             link.open()
         except (OSError, ValueError) as error:
@@ -77,7 +73,7 @@ def open_link(address: Address) -> UdpLink | StreamLink:
     except (OSError, UnicodeError) as error:
         raise ConfigError(f"LINK: there is no host {address.name[:80]!r}") from error
     if address.kind == "tcp":
-        return StreamLink(lambda: _connected(family, peer), lambda connection: connection.recv(_MOST_BYTES), _send)
+        return StreamLink(lambda: _connected(family, peer))
     return UdpLink(address, family, peer)
 
 
@@ -90,8 +86,7 @@ class UdpLink:
     def __init__(self, address: Address, family: int, peer: Any) -> None:
         self._socket = socket.socket(family, socket.SOCK_DGRAM)
         self._socket.setblocking(False)
-        self._last: Any = None
-        self._peer = None if address.kind == "udpin" else peer
+        self._last = self._peer = peer if address.kind == "udpout" else None
         if address.kind == "udpin":
             try:
                 self._socket.bind(peer)
@@ -121,19 +116,15 @@ class UdpLink:
 
 
 class StreamLink:
-    """A TCP connection or a serial port, opened again once a second while it is closed. All three raise OSError.
+    """A TCP connection or a serial port, opened again once a second while it is closed.
 
-    made  opens it
-    take  returns received bytes; empty if it was closed
-    give  sends bytes on it
+    made  opens it, so that its file neither waits for bytes nor for room for them. Raises OSError
     """
 
     whole = False
 
-    def __init__(
-        self, made: Callable[[], Any], take: Callable[[Any], bytes], give: Callable[[Any, bytes], object]
-    ) -> None:
-        self._made, self._take, self._give = made, take, give
+    def __init__(self, made: Callable[[], Any]) -> None:
+        self._made = made
         self._stream: Any = None
         self._due_s = 0.0
 
@@ -149,7 +140,7 @@ class StreamLink:
             time.sleep(within_s)
         elif select.select([self._stream], [], [], within_s)[0]:
             with contextlib.suppress(OSError):
-                if data := self._take(self._stream):
+                if data := os.read(self._stream.fileno(), _MOST_BYTES):
                     return data
             self.close()
         return None
@@ -160,10 +151,10 @@ class StreamLink:
     def write(self, data: bytes) -> None:
         if self._stream is not None:
             try:
-                self._give(self._stream, data)
-            except BlockingIOError:
-                pass
-            except OSError:
+                whole = os.write(self._stream.fileno(), data) == len(data)
+            except OSError as error:
+                whole = isinstance(error, BlockingIOError)  # all of it is lost
+            if not whole:  # its peer reads nothing, and half a message would spoil what follows
                 self.close()
 
     def close(self) -> None:
@@ -184,8 +175,3 @@ def _connected(family: int, peer: Any) -> socket.socket:
         made.close()
         raise
     return made
-
-
-def _send(connection: socket.socket, data: bytes) -> None:
-    if connection.send(data) < len(data):
-        raise OSError("its peer reads nothing, and half a message would spoil what follows")

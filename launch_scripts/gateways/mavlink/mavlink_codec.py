@@ -6,11 +6,12 @@ not heard. Numbers are those of MAVLink's common.xml.
 
 from __future__ import annotations
 
-import io
 import math
+from types import SimpleNamespace
 from typing import Any
 
 from msgspec import Struct
+from pymavlink.dialects.v20 import common
 
 SYSID, COMPID = 245, 191
 """Ours: a system which is no vehicle, and its onboard computer."""
@@ -150,11 +151,16 @@ class Setpoint(Struct, frozen=True):
 Outgoing = Heartbeat | Command | MissionCount | MissionItem | MissionCurrent | MissionCancelled | Setpoint
 
 
-def pymavlink() -> Any:
-    """The dialect "common" of MAVLink 2."""
-    from pymavlink.dialects.v20 import common
+class _Parser(common.MAVLink):  # type: ignore[misc]
+    """pymavlink's parser with one fault repaired: a forged signature of a late time shut out the vehicle, whose own
+    times are earlier."""
 
-    return common
+    def check_signature(self, msgbuf: bytearray, src_system: int, src_component: int) -> bool:
+        before = dict(self.signing.stream_timestamps)
+        good = bool(super().check_signature(msgbuf, src_system, src_component))
+        if not good:
+            self.signing.stream_timestamps = before
+        return good
 
 
 class Wire:
@@ -168,9 +174,8 @@ class Wire:
     def __init__(self, sysid: int | None, key: bytes | None, now_s: float) -> None:
         self.vehicle = sysid
         """The system number of the vehicle, once it is known."""
-        self._common = pymavlink()
-        self._sent = io.BytesIO()
-        self._mav = _parser(self._common)(self._sent, srcSystem=SYSID, srcComponent=COMPID)
+        self._sent: list[bytes] = []
+        self._mav = _Parser(SimpleNamespace(write=self._sent.append), srcSystem=SYSID, srcComponent=COMPID)
         self._mav.robust_parsing = True
         if key is not None:
             signing = self._mav.signing
@@ -203,53 +208,29 @@ class Wire:
 
     def write(self, message: Outgoing) -> bytes:
         """Returns a message to the vehicle as bytes; none while no vehicle is known, except for a heartbeat."""
-        if self.vehicle is None and not isinstance(message, Heartbeat):
+        mav, to = self._mav, (self.vehicle, AUTOPILOT)
+        if isinstance(message, Heartbeat):
+            mav.heartbeat_send(_ONBOARD_CONTROLLER, _INVALID_AUTOPILOT, 0, 0, _ACTIVE)
+        elif self.vehicle is None:
             return b""
-        self._mav.send(self._packed(message, self.vehicle or 0))
-        data = self._sent.getvalue()
-        self._sent.seek(0)
-        self._sent.truncate()
-        return data
-
-    def _packed(self, message: Outgoing, to: int) -> Any:
-        common = self._common
         match message:
-            case Heartbeat():
-                return common.MAVLink_heartbeat_message(_ONBOARD_CONTROLLER, _INVALID_AUTOPILOT, 0, 0, _ACTIVE, 3)
             case Command(command=command, params=params):
                 given = (*map(float, params), *[0.0] * (7 - len(params)))
-                return common.MAVLink_command_long_message(to, AUTOPILOT, command, 0, *given)
+                mav.command_long_send(*to, command, 0, *given)
             case MissionCount(items=items):
-                return common.MAVLink_mission_count_message(to, AUTOPILOT, items, 0)
-            case MissionItem():
-                return common.MAVLink_mission_item_int_message(
-                    to, AUTOPILOT, message.seq, message.frame, message.command, int(message.current), 1,
-                    0.0, 0.0, 0.0, math.nan, *_degrees7(message), message.height_m, 0,
-                )  # fmt: skip
+                mav.mission_count_send(*to, items)
+            case MissionItem(height_m=height_m, current=current):
+                how = message.seq, message.frame, message.command, int(current), 1, 0.0, 0.0, 0.0, math.nan
+                mav.mission_item_int_send(*to, *how, *_degrees7(message), height_m)
             case MissionCurrent(seq=seq):
-                return common.MAVLink_mission_set_current_message(to, AUTOPILOT, seq)
+                mav.mission_set_current_send(*to, seq)
             case MissionCancelled():
-                return common.MAVLink_mission_ack_message(to, AUTOPILOT, _CANCELLED, 0)
-            case Setpoint(height_m=height_m):
-                return common.MAVLink_set_position_target_global_int_message(
-                    0, to, AUTOPILOT, message.frame, _PLACE_ONLY if height_m is None else _POSITION_ONLY,
-                    *_degrees7(message), height_m or 0.0, *[0.0] * 8,
-                )  # fmt: skip
-
-
-def _parser(common: Any) -> Any:
-    """pymavlink's parser with one fault repaired: a forged signature of a late time shut out the vehicle, whose own
-    times are earlier."""
-
-    class Parser(common.MAVLink):  # type: ignore[misc]
-        def check_signature(self, msgbuf: bytearray, src_system: int, src_component: int) -> bool:
-            before = dict(self.signing.stream_timestamps)
-            good = bool(super().check_signature(msgbuf, src_system, src_component))
-            if not good:
-                self.signing.stream_timestamps = before
-            return good
-
-    return Parser
+                mav.mission_ack_send(*to, _CANCELLED)
+            case Setpoint(frame=frame, height_m=height_m):
+                mask = _PLACE_ONLY if height_m is None else _POSITION_ONLY
+                where = *_degrees7(message), height_m or 0.0
+                mav.set_position_target_global_int_send(0, *to, frame, mask, *where, *[0.0] * 8)
+        return self._sent.pop()
 
 
 def _degrees7(place: MissionItem | Setpoint) -> tuple[int, int]:

@@ -7,10 +7,10 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from launch_scripts.gateways.mavlink.adapter import Action, Adapter, Follow, Report, Tell, Unfollow, Withdraw
+from launch_scripts.gateways.mavlink.adapter import Action, Adapter, Follow, Report, Unfollow, Withdraw
 from launch_scripts.gateways.mavlink.guidance import Wishes
 from launch_scripts.gateways.mavlink.link import Address, StreamLink, UdpLink, open_link
-from launch_scripts.gateways.mavlink.mavlink_codec import Wire, pymavlink
+from launch_scripts.gateways.mavlink.mavlink_codec import Wire
 from launch_scripts.stop_requests import stop_requests
 from swarm.client import ConfigError, Frame, Route, Stream, Swarm, SwarmError, Vehicle
 
@@ -52,7 +52,6 @@ def run(
     tell: Callable[[str], None],
 ) -> None:
     """Until SIGINT or SIGTERM. Raises SwarmError if the swarm or the link cannot be reached, or the run is over."""
-    pymavlink()
     with connect() as swarm:
         check_ground(swarm.frame)
         with contextlib.closing(open_link(address)) as link:
@@ -123,8 +122,8 @@ class Shell:
 
     def _perform(self, action: Action) -> None:
         match action:
-            case Tell(sentence=sentence):
-                self._tell(sentence)
+            case str():
+                self._tell(action)
             case Report(x_m=x_m, y_m=y_m, heading_rad=heading_rad, speed_m_per_s=speed_m_per_s):
                 if self._vehicle is None:
                     wishes = self._wishes

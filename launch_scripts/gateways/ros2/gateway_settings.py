@@ -135,10 +135,6 @@ class Robots(Section, frozen=True, kw_only=True):
     plan: Topic = "/{robot}/plan"
     goal: Topic = "/{robot}/goal_pose"
 
-    def own(self, topic: str) -> str:
-        """A topic of the one robot, if it is one."""
-        return topic.replace(topic_table.ROBOT, self.id or topic_table.ROBOT)
-
     def robot_of(self, topic: str) -> str | None:
         """The robot that has a topic; None if it is none of these robots."""
         if self.id is not None:
@@ -284,7 +280,7 @@ def _incoming_faults(settings: IncomingSettings) -> Iterator[str]:
         where, part = f"robots[{n}]", topic_table.ROBOT
         if (part in robots.topic) != (robots.id is None):
             yield f"{where}: topic is {robots.topic!r}, expected {part} in it, or an id and none in it"
-        own = {key: robots.own(getattr(robots, key)) for key in ("topic", "plan", "goal")}
+        own = {key: getattr(robots, key).replace(part, robots.id or part) for key in ("topic", "plan", "goal")}
         if len(set(own.values())) < len(own):
             yield f"{where}: topic, plan and goal are {', '.join(own.values())}, expected three topics"
         for key, topic in own.items():

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections import Counter
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from fnmatch import fnmatchcase
 from typing import Any, NamedTuple
@@ -20,8 +20,7 @@ from numpy.typing import NDArray
 from launch_scripts.gateways.ros2 import map_messages, ros_messages
 from launch_scripts.gateways.ros2.gateway_settings import Settings
 from launch_scripts.gateways.ros2.map_messages import MapFeed
-from launch_scripts.gateways.ros2.ros_messages import Level, PackedPlaces, Place, RosMap, RosMessages, ros_name
-from launch_scripts.gateways.ros2.ros_types import RosTypes
+from launch_scripts.gateways.ros2.ros_messages import Level, PackedPlaces, Place, RosMessages, ros_name
 from launch_scripts.gateways.ros2.topic_table import TARGET, VEHICLE, TopicRow
 from shared_map.cost_map import merged
 from swarm.client.observer import Observer, SeenTarget, SeenVehicle
@@ -39,6 +38,7 @@ _STANDS_NS = NS_PER_S // 2
 """A vehicle without another position for this time is at rest."""
 _BAD_STATES = ("stranded", "lost")
 ToWgs84 = Callable[[float, float], tuple[float, float]]
+Say = Callable[[str], None]
 
 
 class Channel(Struct, frozen=True):
@@ -63,14 +63,13 @@ class Put(Struct, frozen=True):
 class Health:
     """State of the gateway's two sides, as the shell knows it.
 
-    run         id of the run
-    swarm_up, ros_up  whether the links to the routers are up
-    counts      messages published, dropped and refused since the start
+    run     id of the run
+    up      whether the links to both routers are up
+    counts  messages published, dropped and refused since the start
     """
 
     run: str = ""
-    swarm_up: bool = True
-    ros_up: bool = True
+    up: bool = True
     counts: Mapping[str, int] = field(default_factory=dict)
 
 
@@ -135,25 +134,24 @@ class Gateway:
     """Outgoing topics of one gateway about one run.
 
     settings  forwarded topics, and their types
-    map       frame of published positions
+    messages  in the frame of published positions
     feed      the shared map
+    say       receives sentences for people
     to_wgs84  (latitude, longitude) of a place of the terrain; None where there are none
     """
 
     def __init__(
-        self, settings: Settings, types: RosTypes, map: RosMap, feed: MapFeed, to_wgs84: ToWgs84 | None = None
+        self, settings: Settings, messages: RosMessages, feed: MapFeed, say: Say, to_wgs84: ToWgs84 | None = None
     ) -> None:
         self._rows = {row.name: row for row in settings.rows() if to_wgs84 is not None or row.name != "fix"}
         self._bare, self._patterns = settings.frames.bare, settings.vehicles
-        self._feed = feed
-        self._messages = RosMessages(types, map)
+        self._messages, self._feed, self._say = messages, feed, say
         self._vehicles: dict[str, Moving] = {}
         """By name in ROS."""
         self._targets: dict[str, str] = {}
         """Name in ROS -> id."""
         self._refused: set[str] = set()
         """Vehicles and targets that are not published; each is reported once."""
-        self._problems: list[str] = []
         self._crew_changed = False
         """Vehicles have come or gone since /tf_static was put."""
         self._transforms: dict[str | None, PackedPlaces] = {}
@@ -164,10 +162,9 @@ class Gateway:
         """Windows that have changed since the map or its updates were put last."""
         self._due_ns = dict.fromkeys(self._rows, 0)
         """Due time of each row, by the clock that never leaps."""
-        self._always = frozenset(self._channels_per(None))
-        self.channels = self._always
+        self.channels = self._channels_now()
         """The topics that are to be up, each a publisher with its token."""
-        made, pose = self._messages, ros_messages.packed_pose(self._messages)
+        pose = ros_messages.packed_pose(messages)
         self._tellers: dict[str, Callable[[_Now], _Told]] = {
             "map": self._tell_map, "map_updates": self._tell_updates, "tf_static": self._tell_static,
             "tf": self._tell_transforms,
@@ -175,7 +172,7 @@ class Gateway:
             "pose": self._tell_each(lambda each, at_ns: pose.at(at_ns, [each.place])),
             "plan": self._tell_plans,
             "fix": self._tell_each(
-                lambda each, at_ns: to_wgs84 and made.fix(at_ns, each.frames[1], *to_wgs84(*each.place[:2]))
+                lambda each, at_ns: to_wgs84 and messages.fix(at_ns, each.frames[1], *to_wgs84(*each.place[:2]))
             ),
             "poses": self._tell_all_poses, "targets": self._tell_targets, "target_pose": self._tell_target_poses,
             "markers": self._tell_markers, "diagnostics": self._tell_diagnostics,
@@ -184,11 +181,6 @@ class Gateway:
     def whole_map(self, stamp_ns: int) -> Any:
         """nav_msgs/OccupancyGrid of the map as it is known now."""
         return map_messages.occupancy_grid(self._messages, stamp_ns, self._feed.occupancy(self._feed.grid.window))
-
-    def take_problems(self) -> list[str]:
-        """Sentences for people since the last call."""
-        taken, self._problems = self._problems, []
-        return taken
 
     def tick(
         self,
@@ -245,9 +237,7 @@ class Gateway:
             if self._targets.setdefault(ros_name(id), id) != id:
                 self._refuse(f"target {id}", f"{self._targets[ros_name(id)]} is called {ros_name(id)}, too")
         if came or gone or len(self._targets) > targets:
-            of_each = ((VEHICLE, self._vehicles), (TARGET, self._targets))
-            own = (self._channels_per(per, name) for per, names in of_each for name in names)
-            self.channels = self._always.union(*own)
+            self.channels = self._channels_now()
 
     def _take(self, id: str, seen: SeenVehicle, now_ns: int) -> bool:
         """Returns True for a vehicle that is published from now on."""
@@ -270,10 +260,15 @@ class Gateway:
     def _refuse(self, who: str, why: str) -> None:
         if who not in self._refused and len(self._refused) < MOST_VEHICLES:
             self._refused.add(who)
-            self._problems.append(f"{who} is not published to ROS: {why}")
+            self._say(f"{who} is not published to ROS: {why}")
 
-    def _channels_per(self, per: str | None, name: str | None = None) -> list[Channel]:
-        return [self._channel(row.name, name) for row in self._rows.values() if row.per == per]
+    def _channels_now(self) -> frozenset[Channel]:
+        names: dict[str | None, Iterable[str | None]] = {
+            None: (None,),
+            VEHICLE: self._vehicles,
+            TARGET: self._targets,
+        }
+        return frozenset(self._channel(row.name, of) for row in self._rows.values() for of in names[row.per])
 
     def _channel(self, row: str, name: str | None = None) -> Channel:
         return Channel(row, self._rows[row].topic.replace(VEHICLE, name or "").replace(TARGET, name or ""))
@@ -368,7 +363,6 @@ class Gateway:
         captures = sum(each.captures for each in now.targets.values())
         grid, health, knows = self._feed.grid, now.health, self._feed.knows_ground
         west_m, south_m = self._messages.map.origin_m
-        up = health.swarm_up and health.ros_up
         vehicles = bad or f"{len(now.vehicles)} vehicles"
         nothing = "marks alone: the terrain of the run is not on this machine"
         rows: tuple[tuple[str, Level, str, Mapping[str, object]], ...] = (
@@ -380,7 +374,8 @@ class Gateway:
             ("map", Level.OK if knows else Level.WARN, "ground and marks" if knows else nothing,
              {"crs": grid.crs, "origin_x_m": west_m, "origin_y_m": south_m, "rows": grid.rows, "cols": grid.cols,
               "resolution_m": grid.resolution_m}),
-            ("gateway", Level.OK if up else Level.ERROR, "both links are up" if up else "a link is down",
+            ("gateway", Level.OK if health.up else Level.ERROR,
+             "both links are up" if health.up else "a link is down",
              {"run": health.run, **dict(sorted(health.counts.items()))}),
         )  # fmt: skip
         told = [self._messages.diagnostic(f"swarm: {row[0]}", *row[1:]) for row in rows]

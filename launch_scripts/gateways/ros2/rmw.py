@@ -18,7 +18,7 @@ TOKEN_SPACE = "@ros2_lv"
 NO_HASH = "TypeHashNotSupported"
 """Stands for the hash where a distribution has none: Humble."""
 _GID_BYTES = 16
-_ATTACHMENT = struct.Struct("<qqB")
+_ATTACHMENT = struct.Struct(f"<qqB{_GID_BYTES}s")
 _TOKEN_PARTS = 13
 """Parts of an endpoint's token that every version has. Newer ones append, which is left unread."""
 _NODE_PARTS = 9
@@ -124,30 +124,22 @@ def type_name_of(dds: str) -> str:
     return f"{parts[0]}/{parts[1]}/{parts[3][:-1]}"
 
 
-@dataclass(frozen=True, slots=True)
-class Attachment:
-    """Attachment of each message, request and reply.
+def attachment(sequence: int, stamp_ns: int, gid: bytes) -> bytes:
+    """Returns the attachment of a message, request or reply: 33 bytes, as Zenoh serialises int64, int64 and array.
 
-    sequence   counted by the sender from 1 on; a reply repeats its request's
-    stamp_ns   when it was sent, since 1970
-    gid        of the sending endpoint; a reply repeats its request's
+    sequence  counted by the sender from 1 on; a reply repeats its request's
+    stamp_ns  when it was sent, since 1970
+    gid       of the sending endpoint; a reply repeats its request's
     """
+    return _ATTACHMENT.pack(sequence, stamp_ns, len(gid), gid)
 
-    sequence: int
-    stamp_ns: int
-    gid: bytes
 
-    def packed(self) -> bytes:
-        """33 bytes, as Zenoh serialises int64, int64 and an array."""
-        return _ATTACHMENT.pack(self.sequence, self.stamp_ns, len(self.gid)) + self.gid
-
-    @classmethod
-    def of(cls, content: bytes) -> Attachment:
-        """Raises ProtocolError."""
-        if len(content) != _ATTACHMENT.size + _GID_BYTES or content[_ATTACHMENT.size - 1] != _GID_BYTES:
-            raise ProtocolError(f"attachment has {len(content)} bytes, expected 33 with a gid of 16")
-        sequence, stamp_ns, _ = _ATTACHMENT.unpack_from(content)
-        return cls(sequence, stamp_ns, content[_ATTACHMENT.size :])
+def read_attachment(content: bytes) -> tuple[int, int, bytes]:
+    """Returns the parts of which an attachment is made. Raises ProtocolError."""
+    if len(content) != _ATTACHMENT.size or content[_ATTACHMENT.size - _GID_BYTES - 1] != _GID_BYTES:
+        raise ProtocolError(f"attachment has {len(content)} bytes, expected 33 with a gid of 16")
+    sequence, stamp_ns, _, gid = _ATTACHMENT.unpack(content)
+    return sequence, stamp_ns, gid
 
 
 def read_token(key: str) -> Endpoint | None:

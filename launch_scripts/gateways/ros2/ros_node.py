@@ -12,15 +12,17 @@ import time
 from collections import Counter, deque
 from collections.abc import Callable
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import suppress
+from contextlib import ExitStack, suppress
 from typing import Any
 
 import zenoh
 from zenoh import ext
 from zenoh.handlers import Callback
 
-from launch_scripts.gateways.ros2.rmw import Attachment, Endpoint, Kind, NodeName, Qos, read_token
+from launch_scripts.gateways.ros2 import rmw
+from launch_scripts.gateways.ros2.rmw import Endpoint, Kind, NodeName, Qos
 from launch_scripts.gateways.ros2.ros_types import REQUEST, RESPONSE, RosTypes
+from launch_scripts.gateways.ros2.topic_table import TopicRow
 from swarm.clock import NS_PER_S
 from swarm.errors import BusError, ProtocolError, SwarmError
 
@@ -37,20 +39,22 @@ Failed = Callable[[str], None]
 class Publisher:
     """Puts messages of one type on one topic. `put` may be called by one thread at a time."""
 
-    def __init__(self, types: RosTypes, endpoint: Endpoint, put: Callable[..., None]) -> None:
+    def __init__(self, node: Node, endpoint: Endpoint, put: Callable[..., None]) -> None:
         self.endpoint = endpoint
-        self._types, self._put = types, put
+        self._node, self._put = node, put
         self._sequence = itertools.count(1)
         self._gid = endpoint.gid
 
     def put(self, message: Any) -> None:
-        """Puts a message, or CDR that was made before. Raises BusError if Zenoh refuses it."""
-        content = self._types.pack(message, self.endpoint.type_name)
-        attachment = Attachment(next(self._sequence), time.time_ns(), self._gid)
+        """Puts a message, or CDR that was made before. One that Zenoh refuses, as without a link, is counted and
+        lost."""
+        content = self._node.types.pack(message, self.endpoint.type_name)
         try:
-            self._put(content, attachment=attachment.packed())
+            self._put(content, attachment=rmw.attachment(next(self._sequence), time.time_ns(), self._gid))
+            self._node.counts["put"] += 1
         except zenoh.ZError as error:
-            raise BusError(f"{self.endpoint.topic} is not put: {error}") from error
+            self._node.counts["put_failed"] += 1
+            log.debug("%s is not put: %s", self.endpoint.topic, error)
 
 
 class Node:
@@ -66,7 +70,9 @@ class Node:
         self._session = session
         self._numbers = itertools.count(1)
         self._declared: dict[Endpoint, list[Any]] = {}
-        self._own: list[Any] = [session.liveliness().declare_token(self.name.token)]
+        self._own = ExitStack()
+        """Takes back the node's token, and what it watches."""
+        self._own.callback(session.liveliness().declare_token(self.name.token).undeclare)
         self._lock = threading.Lock()
 
     @property
@@ -80,11 +86,11 @@ class Node:
         """True if a router is connected now. Zenoh connects again by itself, and repeats all declarations there."""
         return bool(self._session.info.routers_zid())
 
-    def publisher(self, topic: str, type_name: str, qos: Qos = Qos.DEFAULT) -> Publisher:
-        endpoint = self._endpoint(Kind.PUBLISHER, topic, type_name, qos)
-        reliability = zenoh.Reliability.BEST_EFFORT if qos is Qos.SENSOR else zenoh.Reliability.RELIABLE
+    def publisher(self, topic: str, row: TopicRow) -> Publisher:
+        endpoint = self._endpoint(Kind.PUBLISHER, topic, row)
+        reliability = zenoh.Reliability.BEST_EFFORT if row.qos is Qos.SENSOR else zenoh.Reliability.RELIABLE
         made: Any
-        if qos is Qos.LATCHED:
+        if row.qos is Qos.LATCHED:
             made = ext.declare_advanced_publisher(
                 self._session,
                 endpoint.key,
@@ -96,14 +102,14 @@ class Node:
         else:
             made = self._session.declare_publisher(endpoint.key, reliability=reliability)
         self._declare(endpoint, made)
-        return Publisher(self.types, endpoint, made.put)
+        return Publisher(self, endpoint, made.put)
 
-    def listen(self, topic: str, type_name: str, qos: Qos, keep: Callable[[zenoh.Sample], object]) -> Endpoint:
+    def listen(self, topic: str, row: TopicRow, keep: Callable[[zenoh.Sample], object]) -> Endpoint:
         """Subscribes. `keep` is called with each sample on Zenoh's threads; `read` makes a message of one."""
-        endpoint = self._endpoint(Kind.SUBSCRIPTION, topic, type_name, qos)
+        endpoint = self._endpoint(Kind.SUBSCRIPTION, topic, row)
         made: Any
         # This node ignores its own messages: a topic may go both ways.
-        if qos is Qos.LATCHED:
+        if row.qos is Qos.LATCHED:
             made = ext.declare_advanced_subscriber(
                 self._session,
                 endpoint.key,
@@ -128,29 +134,28 @@ class Node:
             self.dropped(endpoint.topic, error)
             return None
 
-    def serve(self, name: str, type_name: str, answer: Callable[[Any, Callable[[Any], None]], None]) -> Endpoint:
+    def serve(self, topic: str, row: TopicRow, answer: Callable[[Any, Callable[[Any], None]], None]) -> Endpoint:
         """Answers a service.
 
         `answer(request, reply)` is called on Zenoh's thread and must return soon; `reply` is called once, then or
         later, on any thread, with a response or its CDR. A client of ROS waits for ever for a missing reply, so
         errors go into the response.
         """
-        endpoint = self._endpoint(Kind.SERVICE, name, type_name, Qos.DEFAULT)
+        endpoint = self._endpoint(Kind.SERVICE, topic, row)
 
         def take(query: zenoh.Query) -> None:
             try:
-                asked = Attachment.of(query.attachment.to_bytes() if query.attachment else b"")
+                sequence, _, gid = rmw.read_attachment(query.attachment.to_bytes() if query.attachment else b"")
                 content = query.payload.to_bytes() if query.payload else b""
-                request = self.types.unpack(content, type_name + REQUEST)
+                request = self.types.unpack(content, row.type_name + REQUEST)
             except ProtocolError as error:
-                self.dropped(name, error)
+                self.dropped(topic, error)
                 return
 
             def reply(response: Any) -> None:
-                attachment = Attachment(asked.sequence, time.time_ns(), asked.gid).packed()
-                content = self.types.pack(response, type_name + RESPONSE)
+                content = self.types.pack(response, row.type_name + RESPONSE)
                 with query, suppress(zenoh.ZError):  # the session may be closed, or the link cut
-                    query.reply(endpoint.key, content, attachment=attachment)
+                    query.reply(endpoint.key, content, attachment=rmw.attachment(sequence, time.time_ns(), gid))
 
             answer(request, reply)
 
@@ -163,7 +168,7 @@ class Node:
 
         def take(sample: zenoh.Sample) -> None:
             try:
-                endpoint = read_token(str(sample.key_expr))
+                endpoint = rmw.read_token(str(sample.key_expr))
             except ProtocolError as error:
                 self.dropped("tokens", error)
                 return
@@ -171,9 +176,8 @@ class Node:
                 seen(endpoint, sample.kind == zenoh.SampleKind.PUT)
 
         # No `get` of tokens: beside a subscription it blocks for ever beyond 256 of them. History brings all.
-        self._own.append(
-            self._session.liveliness().declare_subscriber(f"@ros2_lv/{domain}/**", Callback(take), history=True)
-        )
+        tokens, key = self._session.liveliness(), f"{rmw.TOKEN_SPACE}/{domain}/**"
+        self._own.callback(tokens.declare_subscriber(key, Callback(take), history=True).undeclare)
 
     def remove(self, endpoint: Endpoint) -> None:
         """Takes an endpoint back. Its last message is not repeated to late subscribers any more."""
@@ -186,13 +190,11 @@ class Node:
         """Takes back all, as `remove` does. The session stays open."""
         for endpoint in list(self._declared):
             self.remove(endpoint)
-        for each in self._own:
-            each.undeclare()
-        self._own = []
+        self._own.close()
 
-    def _endpoint(self, kind: Kind, topic: str, type_name: str, qos: Qos) -> Endpoint:
-        type_hash = self.types.hash_of(type_name)
-        return Endpoint(self.name, next(self._numbers), kind, topic, type_name, type_hash, qos.value)
+    def _endpoint(self, kind: Kind, topic: str, row: TopicRow) -> Endpoint:
+        type_hash = self.types.hash_of(row.type_name)
+        return Endpoint(self.name, next(self._numbers), kind, topic, row.type_name, type_hash, row.qos.value)
 
     def _declare(self, endpoint: Endpoint, made: Any) -> None:
         token = self._session.liveliness().declare_token(endpoint.token)
@@ -248,6 +250,7 @@ class WorkQueue:
 class Input:
     """The newest message of a topic, taken at ticks and at most at this interval.
 
+    row    its type, quality and rate
     take   is called with it, and the time by time.monotonic_ns. Raises SwarmError on a refused message
     queue  `take` may wait, and is called by its thread; None: it is called by `tick`
     """
@@ -256,29 +259,29 @@ class Input:
         self,
         node: Node,
         topic: str,
-        type_name: str,
-        hz: float,
+        row: TopicRow,
         take: Callable[[Any, int], None],
         *,
-        qos: Qos = Qos.DEFAULT,
         most_bytes: int = _MOST_BYTES,
         queue: WorkQueue | None = None,
     ) -> None:
         self.refused = 0
         self._node, self._take, self._most_bytes, self._queue = node, take, most_bytes, queue
-        self._period_ns = int(NS_PER_S / hz)
+        self._period_ns = int(NS_PER_S / row.hz) if row.hz else 0
         self._due_ns = 0
         self._waiting: deque[zenoh.Sample] = deque(maxlen=1)
         self._held: Any = None
         """Message for which the queue had no room."""
         self._said: str | None = None
-        self.endpoint = node.listen(topic, type_name, qos, self._waiting.append)
+        self.endpoint = node.listen(topic, row, self._waiting.append)
 
     def tick(self, now_ns: int) -> None:
         """Processes received messages, if that is due."""
         if now_ns < self._due_ns:
             return
-        message = self._newest() or self._held
+        message = self._held
+        if self._waiting:  # only the newest is decoded
+            message = self._node.read(self.endpoint, self._waiting.pop(), self._most_bytes) or self._held
         if message is None:
             return
         self._due_ns, self._held = now_ns + self._period_ns, None
@@ -298,14 +301,6 @@ class Input:
         if kind != self._said:
             self._said = kind
             log.warning("topic %s: %s", self.endpoint.topic, sentence)
-
-    def close(self) -> None:
-        """Hears no more."""
-        self._node.remove(self.endpoint)
-
-    def _newest(self) -> Any | None:
-        """The newest message, once; None if none has come. Only this one is decoded."""
-        return self._node.read(self.endpoint, self._waiting.pop(), self._most_bytes) if self._waiting else None
 
     def _try(self, message: Any, now_ns: int) -> None:
         self._take(message, now_ns)

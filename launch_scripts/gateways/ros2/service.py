@@ -8,22 +8,23 @@ from __future__ import annotations
 
 import logging
 import time
-from collections import Counter, deque
+from collections import deque
 from collections.abc import Callable
+from contextlib import closing
 from pathlib import Path
 
 from launch_scripts.gateways.ros2.gateway_settings import IncomingSettings, Settings
 from launch_scripts.gateways.ros2.incoming.dispatch import Incoming
 from launch_scripts.gateways.ros2.map_messages import MapFeed
-from launch_scripts.gateways.ros2.outgoing import Channel, Gateway, Health, Put, ToWgs84
+from launch_scripts.gateways.ros2.outgoing import Channel, Gateway, Health, Say, ToWgs84
 from launch_scripts.gateways.ros2.rmw import Endpoint, PeerWatch
-from launch_scripts.gateways.ros2.ros_messages import RosMap
+from launch_scripts.gateways.ros2.ros_messages import RosMap, RosMessages
 from launch_scripts.gateways.ros2.ros_node import Node, Publisher, open_ros
 from launch_scripts.gateways.ros2.ros_types import types_of
 from launch_scripts.gateways.ros2.topic_table import ROWS
 from shared_map.terrain.store import find_prepared
 from swarm.client import Frame, Observer, Swarm, SwarmError
-from swarm.errors import BusError, ConfigError
+from swarm.errors import ConfigError
 
 log = logging.getLogger(__name__)
 
@@ -34,7 +35,6 @@ _MOST_SEEN = 4096
 _POSITIONS_S = 0.1
 """Ten samples a second, as often as vehicles tell where they are by default (docs/design/ros2-gateway.md): a
 position is a tenth of a second old at most."""
-Say = Callable[[str], None]
 
 
 def serve(
@@ -52,13 +52,10 @@ def serve(
         while swarm is not None:
             with swarm, swarm.observer(every_s=_POSITIONS_S) as observer:
                 node = Node(ros, settings.ros.node, types_of(settings.ros.distribution), settings.ros.domain)
-                run = _Run(settings, node, swarm, observer, runs, say)
-                try:
+                with closing(_Run(settings, node, swarm, observer, runs, say)) as run:
                     while not stopping() and swarm.ended is None:
                         run.turn()
                         time.sleep(TICK_S)
-                finally:
-                    run.close()
                 ended = swarm.ended
             if ended is not None:
                 say(f"{ended}")
@@ -82,7 +79,7 @@ class _Run:
         self, settings: Settings, node: Node, swarm: Swarm, observer: Observer, runs: Path, say: Say
     ) -> None:
         side, grid = settings.ros, swarm.frame.grid
-        map = RosMap(grid, settings.frames.map)
+        messages = RosMessages(node.types, RosMap(grid, settings.frames.map))
         forwards = {row.name for row in settings.rows()}
         folder = Path(settings.swarm.terrain) if settings.swarm.terrain else None
         terrain = find_prepared(swarm.run.terrain, folder, runs)
@@ -93,12 +90,10 @@ class _Run:
             )
         to_wgs84 = _to_wgs84(swarm.frame, say) if "fix" in forwards else None
         self._swarm, self._observer, self._say = swarm, observer, say
-        self._gateway = Gateway(settings, node.types, map, MapFeed(grid, terrain), to_wgs84)
+        self._gateway = Gateway(settings, messages, MapFeed(grid, terrain), say, to_wgs84)
         self._node = node
-        self._incoming: Incoming | None = None
         self._publishers: dict[Channel, Publisher] = {}
         self._declared: frozenset[Channel] = frozenset()
-        self._counts: Counter[str] = Counter()
         self._up = {"swarm": True, "ROS": True}
         self._watch = PeerWatch()
         self._seen: deque[Endpoint] = deque(maxlen=_MOST_SEEN)
@@ -107,9 +102,9 @@ class _Run:
             f"node /{side.node} in domain {side.domain} at {side.endpoint}, {side.distribution}; "
             f"run {swarm.run_id}, scenario {swarm.scenario}"
         )
-        if settings.incoming != IncomingSettings():
-            map_now = (lambda: self._gateway.whole_map(time.time_ns())) if "map" in forwards else None
-            self._incoming = Incoming(self._node, swarm, settings.incoming, map, map_now, lambda: observer.vehicles)
+        serves_map = "map" in forwards and settings.incoming != IncomingSettings()
+        map_now = (lambda: self._gateway.whole_map(time.time_ns())) if serves_map else None
+        self._incoming = Incoming(node, swarm, settings.incoming, messages, map_now, lambda: observer.vehicles)
 
     def turn(self) -> None:
         """Performs due work. Nothing here waits for ROS."""
@@ -117,24 +112,19 @@ class _Run:
             if up != self._up[side]:
                 self._up[side] = up
                 self._say(f"the {side} router {'is back' if up else 'is disconnected: waiting for it'}")
-        robots = () if self._incoming is None else self._incoming.robots
-        now_ns, stamp_ns, swarm_now_ns = time.monotonic_ns(), time.time_ns(), self._swarm.now_ns
-        puts = self._gateway.tick(now_ns, stamp_ns, swarm_now_ns, self._observer, self._health(), robots)
+        clocks = time.monotonic_ns(), time.time_ns(), self._swarm.now_ns
+        puts = self._gateway.tick(*clocks, self._observer, self._health(), self._incoming.robots)
         self._declare(self._gateway.channels)
         for put in puts:
-            self._put(put)
-        if self._incoming is not None:
-            self._incoming.tick(time.monotonic_ns())
-        problems = self._gateway.take_problems()
+            self._publishers[put.channel].put(put.message)
+        self._incoming.tick(time.monotonic_ns())
         while self._seen:
-            problems += self._watch.sentences(self._seen.popleft(), self._node.endpoints)
-        for sentence in problems:
-            self._say(sentence)
+            for sentence in self._watch.sentences(self._seen.popleft(), self._node.endpoints):
+                self._say(sentence)
 
     def close(self) -> None:
         """Takes back all that was declared."""
-        if self._incoming is not None:
-            self._incoming.close()
+        self._incoming.close()
         self._node.close()
 
     def _declare(self, channels: frozenset[Channel]) -> None:
@@ -145,23 +135,13 @@ class _Run:
         for channel in self._publishers.keys() - channels:
             self._node.remove(self._publishers.pop(channel).endpoint)
         for channel in channels - self._publishers.keys():
-            row = ROWS[channel.row]
-            self._publishers[channel] = self._node.publisher(channel.topic, row.type_name, row.qos)
-
-    def _put(self, put: Put) -> None:
-        try:
-            self._publishers[put.channel].put(put.message)
-            self._counts["put"] += 1
-        except BusError as error:
-            self._counts["put_failed"] += 1
-            log.debug("%s: %s", put.channel.topic, error)
+            self._publishers[channel] = self._node.publisher(channel.topic, ROWS[channel.row])
 
     def _health(self) -> Health:
-        counts = {**self._counts, **self._node.counts}
-        counts |= {f"swarm_{name}": count for name, count in self._swarm.counts.items()}
-        if self._incoming is not None:
-            counts |= {f"from_ros_{name}": count for name, count in self._incoming.counts.items()}
-        return Health(self._swarm.run_id, self._up["swarm"], self._up["ROS"], counts)
+        counts = {**self._node.counts}
+        for side, counted in (("swarm", self._swarm.counts), ("from_ros", self._incoming.counts)):
+            counts |= {f"{side}_{name}": count for name, count in counted.items()}
+        return Health(self._swarm.run_id, all(self._up.values()), counts)
 
 
 def _to_wgs84(frame: Frame, say: Say) -> ToWgs84 | None:

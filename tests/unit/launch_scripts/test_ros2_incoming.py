@@ -5,6 +5,7 @@ import random
 import threading
 from collections.abc import Callable
 from contextlib import suppress
+from dataclasses import replace
 from itertools import pairwise
 from types import SimpleNamespace
 from typing import Any
@@ -30,6 +31,7 @@ from launch_scripts.gateways.ros2.incoming.ros_places import (
 from launch_scripts.gateways.ros2.ros_messages import RosMap, RosMessages, quaternion_of
 from launch_scripts.gateways.ros2.ros_node import Input, WorkQueue
 from launch_scripts.gateways.ros2.ros_types import types_of
+from launch_scripts.gateways.ros2.topic_table import INCOMING
 from swarm.clock import NS_PER_S
 from swarm.errors import ConfigError, ProtocolError
 from swarm.grid import GridSpec
@@ -107,7 +109,7 @@ def test_the_swarm_is_told_valid_places_at_a_bounded_rate_whatever_comes(words: 
         told_ns.append(now_ns)
 
     node: Any = FakeNode(TYPES)
-    poses = Input(node, "/uav/odom", KINDS[0], hz, take)
+    poses = Input(node, "/uav/odom", replace(INCOMING["robot"], hz=hz), take)
     now_ns, heard = 0, False
     for message, step_ns in words:
         now_ns += step_ns
@@ -154,7 +156,7 @@ def test_poses_tell_a_speed_that_the_messages_do_not() -> None:
 def test_a_reason_is_said_once_until_a_good_message_comes(caplog: pytest.LogCaptureFixture) -> None:
     node: Any = FakeNode(TYPES)
     track = Track(FrameReader(MAP), 2.0)
-    poses = Input(node, "/uav/odom", KINDS[0], 10.0, track.on_reading)  # type: ignore[arg-type]
+    poses = Input(node, "/uav/odom", INCOMING["robot"], track.on_reading)  # type: ignore[arg-type]
     for number, frame in enumerate(["odom"] * 20 + ["map", "odom"]):
         node.topics["/uav/odom"].waiting.append(odometry(50, 50, frame=frame))
         poses.tick(number * NS_PER_S)

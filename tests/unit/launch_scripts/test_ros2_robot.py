@@ -17,6 +17,7 @@ from launch_scripts.gateways.ros2.rmw import Endpoint, Kind, NodeName
 from launch_scripts.gateways.ros2.ros_messages import Level, RosMap, RosMessages
 from launch_scripts.gateways.ros2.ros_node import Input, WorkQueue
 from launch_scripts.gateways.ros2.ros_types import types_of
+from launch_scripts.gateways.ros2.topic_table import INCOMING
 from swarm.client import Route
 from swarm.clock import NS_PER_S
 
@@ -32,17 +33,9 @@ class World:
         self.node: Any = FakeNode(TYPES)
         map = RosMap(self.swarm.frame.grid)
         self.messages = RosMessages(TYPES, map)
-        robots = Robots(lease_s=10.0, **settings)
+        robots, routes = Robots(lease_s=10.0, **settings), cast(Any, None)
         self.robots = {
-            id: Robot(
-                id,
-                robots,
-                cast(Any, self.node),
-                self.swarm,
-                cast(Any, None),
-                self.messages,
-                taken.__contains__,
-            )
+            id: Robot(id, robots, self.node, self.swarm, routes, self.messages, taken.__contains__)
             for id in ("one", "two")
         }
         self.now_ns = NS_PER_S
@@ -141,7 +134,7 @@ def test_areas_are_told_once_and_taken_away_where_they_are_drawn_no_more(monkeyp
     settings = IncomingSettings(
         zones=(ZoneSettings(name="works", topic="/works"),), grids=(GridSettings(name="seen", topic="/seen"),)
     )
-    incoming = Incoming(cast(Any, node), swarm, settings)
+    incoming = Incoming(cast(Any, node), swarm, settings, RosMessages(TYPES, RosMap(frame.grid)))
     side, rows, cols = frame.grid.resolution_m, frame.grid.rows, frame.grid.cols
     corners = [{"x": x * side, "y": y * side} for x, y in ((0.5, 0.5), (1.5, 0.5), (1.5, 1.5))]
     square = TYPES.make("geometry_msgs/msg/PolygonStamped", header={"frame_id": "map"}, polygon={"points": corners})
@@ -162,7 +155,7 @@ def test_what_the_queue_has_no_room_for_is_taken_at_a_later_tick() -> None:
     node: Any = FakeNode(TYPES)
     taken: list[Any] = []
     full = WorkQueue("full", 1, 0)
-    area = Input(node, "/works", "", 1.0, lambda message, _: taken.append(message), queue=full)
+    area = Input(node, "/works", INCOMING["zone"], lambda message, _: taken.append(message), queue=full)
     node.topics["/works"].waiting.append("polygon")
     area.tick(0)
     assert not taken
@@ -173,8 +166,9 @@ def test_what_the_queue_has_no_room_for_is_taken_at_a_later_tick() -> None:
 
 
 def test_topics_of_another_gateway_are_no_robots() -> None:
-    node = FakeNode(TYPES)
-    incoming = Incoming(cast(Any, node), Program(SwarmModel()).swarm, IncomingSettings(robots=(Robots(),)))
+    node, swarm = FakeNode(TYPES), Program(SwarmModel()).swarm
+    messages = RosMessages(TYPES, RosMap(swarm.frame.grid))
+    incoming = Incoming(cast(Any, node), swarm, IncomingSettings(robots=(Robots(),)), messages)
     kind = "nav_msgs/msg/Odometry"
     for number, name in enumerate((node.name.name, "driver")):
         seen = Endpoint(
@@ -182,7 +176,7 @@ def test_topics_of_another_gateway_are_no_robots() -> None:
         )
         node.tell(seen, True)
     incoming.tick(NS_PER_S)
-    assert incoming.robots == {"r1"}
+    assert set(incoming.robots) == {"r1"}
     node.tell(seen, False)
     incoming.tick(2 * NS_PER_S)
     assert not incoming.robots

@@ -15,6 +15,7 @@ from hypothesis import strategies as st
 from launch_scripts.gateways.ros2 import rmw
 from launch_scripts.gateways.ros2.ros_node import Input, Node
 from launch_scripts.gateways.ros2.ros_types import Distribution, types_of
+from launch_scripts.gateways.ros2.topic_table import TopicRow
 from swarm.errors import ProtocolError
 
 # The hashes as ROS nodes print them (`ros2 topic info -v`) and other stacks publish them.
@@ -91,17 +92,17 @@ def test_no_name_of_a_peer_steers_a_terminal(place: int, sign: str) -> None:
 
 @given(st.integers(-(2**63), 2**63 - 1), st.integers(0, 2**63 - 1), st.binary(min_size=16, max_size=16))
 def test_attachments_are_33_bytes_and_read_back(sequence: int, stamp_ns: int, gid: bytes) -> None:
-    packed = rmw.Attachment(sequence, stamp_ns, gid).packed()
+    packed = rmw.attachment(sequence, stamp_ns, gid)
     assert (len(packed), packed[16], packed[17:]) == (33, 16, gid)
     assert int.from_bytes(packed[:8], "little", signed=True) == sequence
-    assert rmw.Attachment.of(packed) == rmw.Attachment(sequence, stamp_ns, gid)
+    assert rmw.read_attachment(packed) == (sequence, stamp_ns, gid)
 
 
 @given(st.binary(max_size=60))
 def test_other_attachments_are_refused(content: bytes) -> None:
     if len(content) != 33 or content[16] != 16:
         with pytest.raises(ProtocolError):
-            rmw.Attachment.of(content)
+            rmw.read_attachment(content)
 
 
 def test_an_empty_request_is_one_byte() -> None:
@@ -123,10 +124,11 @@ def test_the_newest_message_waits_until_somebody_asks_and_is_taken_once() -> Non
     endpoint = SimpleNamespace(topic="/said", type_name=name)
     kept: list[Callable[[Any], None]] = []
     node: Any = SimpleNamespace(types=types, dropped=lambda topic, error: None)
-    node.listen = lambda topic, type_name, qos, keep: kept.append(keep) or endpoint
+    node.listen = lambda topic, row, keep: kept.append(keep) or endpoint
     node.read = partial(Node.read, node)
     taken: list[str] = []
-    heard = Input(node, "/said", name, 1e9, lambda message, _: taken.append(message.data), most_bytes=100)
+    row = TopicRow("said", "/said", name, rmw.Qos.DEFAULT, "", hz=1e9)
+    heard = Input(node, "/said", row, lambda message, _: taken.append(message.data), most_bytes=100)
     now_ns = count()
     for data, ticks in (("old", 0), ("new", 2), ("x" * 200, 1)):
         kept[0](SimpleNamespace(payload=zenoh.ZBytes(types.pack(types.make(name, data=data), name))))

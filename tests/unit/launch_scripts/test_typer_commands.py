@@ -162,10 +162,10 @@ def test_doctor_says_how_everything_is(tmp_path: Path, monkeypatch: pytest.Monke
         ("packages", "version_of", lambda package: "0.1", "failure", "eclipse-zenoh is 0.1, expected "),
         ("cores", "os.sched_getaffinity", lambda pid: {0}, "warning", "1: processes take turns"),
         ("cores", "os.getloadavg", lambda: (99.0, 1.0, 1.0), "warning", "load of 99.0"),
-        ("memory", "available_bytes", lambda: 1 << 28, "warning", "0.3 GB are free"),
+        ("memory", "this_machine", lambda runs: machine.Resources(2, 1 << 28, 1), "warning", "0.3 GB are free"),
         ("open files", "resource.getrlimit", lambda which: (256, 8192), "warning", "`ulimit -n 4096`"),
-        ("clock", "_clock_state", lambda: 5, "warning", "not synchronised"),
-        ("clock", "_clock_state", lambda: 0, "ok", "synchronised"),
+        ("clock", "ctypes.CDLL", lambda _: SimpleNamespace(adjtimex=lambda _: 5), "warning", "not synchronised"),
+        ("clock", "ctypes.CDLL", lambda _: SimpleNamespace(adjtimex=lambda _: 0), "ok", "synchronised"),
         ("disk", "shutil.disk_usage", lambda path: SimpleNamespace(free=1 << 20), "warning", "are free in"),
     ],
 )

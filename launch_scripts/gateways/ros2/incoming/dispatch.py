@@ -11,10 +11,10 @@ from launch_scripts.gateways.ros2.gateway_settings import GridSettings, Incoming
 from launch_scripts.gateways.ros2.incoming.robot import MOST_ASKED, ROUTE_THREADS, Robot
 from launch_scripts.gateways.ros2.incoming.ros_places import FrameReader, closed_cells, corners_of
 from launch_scripts.gateways.ros2.rmw import Endpoint, Kind
-from launch_scripts.gateways.ros2.ros_messages import RosMap, RosMessages, ros_name
+from launch_scripts.gateways.ros2.ros_messages import RosMessages, ros_name
 from launch_scripts.gateways.ros2.ros_node import Input, Node, WorkQueue
-from launch_scripts.gateways.ros2.ros_types import LARGEST_MESSAGE_BYTES
-from launch_scripts.gateways.ros2.topic_table import GRID, MAP_SERVER, POSE_TYPES, SET_POSE, VEHICLE_GOAL, ZONE
+from launch_scripts.gateways.ros2.ros_types import LARGEST_MESSAGE_BYTES, RESPONSE
+from launch_scripts.gateways.ros2.topic_table import INCOMING, POSE_TYPES, TopicRow
 from launch_scripts.plain_text import number_of
 from swarm.client import Swarm
 from swarm.clock import NS_PER_S
@@ -33,7 +33,6 @@ _MOST_NEWS = 1 << 14
 _MOST_ORDERS = 8
 """Orders of which one is being obeyed, which takes seconds, while the rest wait; more are refused at once
 (docs/design/ros2-gateway.md)."""
-_TRIGGER = "std_srvs/srv/Trigger"
 _TRACKER = "ros2"
 """Name of the tracker that the gateway is: its next start takes its targets over at once."""
 
@@ -45,7 +44,7 @@ class Incoming:
     node      of the ROS side
     swarm     a connection; it is not closed here
     settings  checked
-    map       the frame in which ROS has the terrain
+    messages  of the ROS side's types, in the frame in which it has the terrain
     map_now   makes a nav_msgs/OccupancyGrid, on the thread of `tick`; None: the map is not served
     vehicles  ids of those that the swarm has now
     """
@@ -55,18 +54,17 @@ class Incoming:
         node: Node,
         swarm: Swarm,
         settings: IncomingSettings,
-        map: RosMap | None = None,
+        messages: RosMessages,
         map_now: Callable[[], Any] | None = None,
         vehicles: Callable[[], Iterable[str]] = tuple,
     ) -> None:
-        self._node, self._swarm, self._settings = node, swarm, settings
-        self._map = map or RosMap(swarm.frame.grid)
-        self._messages = RosMessages(node.types, self._map)
-        self._reader = FrameReader(self._map)
+        self._node, self._swarm, self._settings, self._messages = node, swarm, settings, messages
+        self._reader = FrameReader(messages.map)
         self._routes = WorkQueue("ros2-routes", ROUTE_THREADS, MOST_ASKED)
         self._orders = WorkQueue("ros2-orders", 1, _MOST_ORDERS)
         """An order waits until it is obeyed, and the next one for it."""
-        self._robots: dict[str, Robot] = {}
+        self.robots: dict[str, Robot] = {}
+        """By id: those that are known, vehicles by now or not."""
         self._publishers: Counter[str] = Counter()
         """Topic of a robot -> how many publish it, as their tokens say."""
         self._news: deque[tuple[Endpoint, bool]] = deque(maxlen=_MOST_NEWS)
@@ -82,15 +80,15 @@ class Incoming:
         self._asked: deque[Callable[[Any], None]] = deque(maxlen=_MOST_ASKED)
         """Replies to those who ask for the map."""
         self._inputs = [
-            *(self._target_input(each) for each in settings.targets),
-            *(self._zone_input(each) for each in settings.zones),
-            *(self._grid_input(each) for each in settings.grids),
+            *map(self._target_input, settings.targets),
+            *map(self._zone_input, settings.zones),
+            *map(self._grid_input, settings.grids),
         ]
         if map_now is not None:
-            node.serve(MAP_SERVER.topic, MAP_SERVER.type_name, lambda _, reply: self._asked.append(reply))
-        if settings.orders:
-            for name in ("pause", "hold", "resume"):
-                self._serve_order(f"/swarm/{name}", resumes=name == "resume")
+            row = INCOMING["map_server"]
+            node.serve(row.topic, row, lambda _, reply: self._asked.append(reply))
+        for name in ("pause", "hold", "resume") if settings.orders else ():
+            self._serve_order(INCOMING[name])
         for robots in settings.robots:
             if robots.id is not None:
                 self._add(robots.id, robots)
@@ -98,14 +96,9 @@ class Incoming:
             node.watch(str(node.name.domain), lambda seen, there: self._news.append((seen, there)))
 
     @property
-    def robots(self) -> frozenset[str]:
-        """Ids of those that are known, vehicles by now or not."""
-        return frozenset(self._robots)
-
-    @property
     def counts(self) -> Mapping[str, int]:
         """Returns the number of robots that are vehicles now, and counts of refused messages of known robots."""
-        robots = self._robots.values()
+        robots = self.robots.values()
         return {"robots": sum(each.present for each in robots), "refused": sum(each.refused for each in robots)}
 
     def tick(self, now_ns: int) -> None:
@@ -113,21 +106,23 @@ class Incoming:
 
         now_ns  by time.monotonic_ns
         """
-        if (self._robots or self._settings.orders) and now_ns >= self._taken_due_ns:
+        if (self.robots or self._settings.orders) and now_ns >= self._taken_due_ns:
             self._taken_due_ns = now_ns + _LOOK_NS
             taken = {ros_name(id): id for id in self._vehicles() if agent_of(id) != id}
             self._taken = frozenset(taken)
-            if self._settings.orders:
-                self._take_goals_of(taken)
+            for name in taken.keys() - self._sendable if self._settings.orders else ():
+                self._sendable.add(name)
+                self._inputs.append(self._goal_input(name, taken[name]))
         for _ in range(len(self._news)):
             self._on_endpoint(*self._news.popleft())
-        for robot in self._robots.values():
+        for robot in self.robots.values():
             robot.tick(now_ns)
         for each in self._inputs:
             each.tick(now_ns)
         if self._asked and self._map_now is not None:
             # All askers get one map. Of more than _MOST_ASKED the oldest get none: their query ends.
-            response = self._node.types.make(f"{MAP_SERVER.type_name}_Response", map=self._map_now())
+            made = INCOMING["map_server"].type_name + RESPONSE
+            response = self._node.types.make(made, map=self._map_now())
             while self._asked:
                 self._asked.popleft()(response)
 
@@ -153,20 +148,20 @@ class Incoming:
                     self._warn(id, f"it publishes {seen.topic} as {hash}, expected {ours[:20]} (--distribution)")
                 continue
             self._publishers[seen.topic] += 1 if there else -1
-            known = self._robots.get(id)
+            known = self.robots.get(id)
             if self._publishers[seen.topic] > 0 and known is None:
                 self._add(id, robots)
             elif self._publishers[seen.topic] <= 0:
                 del self._publishers[seen.topic]
                 if known is not None and known.topic == seen.topic:
-                    self._robots.pop(id).close()
+                    self.robots.pop(id).close()
             return
 
     def _add(self, id: str, robots: Robots) -> None:
-        if len(self._robots) >= MOST_ROBOTS:
+        if len(self.robots) >= MOST_ROBOTS:
             self._warn(id, f"there are {MOST_ROBOTS} already")
             return
-        self._robots[id] = Robot(
+        self.robots[id] = Robot(
             id, robots, self._node, self._swarm, self._routes, self._messages, lambda name: name in self._taken
         )
 
@@ -185,26 +180,17 @@ class Incoming:
             place = self._reader.pose(message.header, message.pose)
             target.at(place.x_m, place.y_m)
 
-        return Input(self._node, self._settings.set_pose_of(id), SET_POSE.type_name, 10.0, take)
-
-    def _take_goals_of(self, vehicles: Mapping[str, str]) -> None:
-        """Takes goals of these vehicles from ROS.
-
-        vehicles  name in ROS -> vehicle
-        """
-        for name in vehicles.keys() - self._sendable:
-            self._sendable.add(name)
-            self._inputs.append(self._goal_input(name, vehicles[name]))
+        return Input(self._node, self._settings.set_pose_of(id), INCOMING["set_pose"], take)
 
     def _goal_input(self, name: str, vehicle: str) -> Input:
-        orders = self._swarm.orders()
+        """name  of the vehicle in ROS"""
+        orders, row = self._swarm.orders(), INCOMING["vehicle_goal"]
 
         def take(message: Any, _: int) -> None:
             place = self._reader.pose(message.header, message.pose)
             orders.send(vehicle, [f"xy:{place.x_m},{place.y_m}"])
 
-        topic = VEHICLE_GOAL.topic.format(vehicle=name)
-        return Input(self._node, topic, VEHICLE_GOAL.type_name, 1.0, take, queue=self._orders)
+        return Input(self._node, row.topic.format(vehicle=name), row, take, queue=self._orders)
 
     def _zone_input(self, zone: ZoneSettings) -> Input:
         """A polygon whose corners are those of the last is not ordered again, unless the zone ends by itself."""
@@ -222,7 +208,7 @@ class Incoming:
                 orders.remove_zone(zone.name)
             before = corners
 
-        return Input(self._node, zone.topic, ZONE.type_name, 1.0, take, qos=ZONE.qos, queue=self._orders)
+        return Input(self._node, zone.topic, INCOMING["zone"], take, queue=self._orders)
 
     def _grid_input(self, grid: GridSettings) -> Input:
         """Cells which the next grid does not close are again as the map had them."""
@@ -231,34 +217,32 @@ class Incoming:
 
         def take(message: Any, _: int) -> None:
             nonlocal closed
-            cells = set(closed_cells(self._map, message, grid.occupied))
+            cells = set(closed_cells(self._messages.map, message, grid.occupied))
             if opened := closed - cells:
                 author.mark(sorted(opened), clear=True)
             if new := cells if grid.for_s is not None else cells - closed:
                 author.mark(sorted(new), lethal=True, for_s=grid.for_s)
             closed = cells
 
-        return Input(
-            self._node, grid.topic, GRID.type_name, 1.0, take,
-            qos=GRID.qos, most_bytes=LARGEST_MESSAGE_BYTES, queue=self._orders,
-        )  # fmt: skip
+        how: dict[str, Any] = {"most_bytes": LARGEST_MESSAGE_BYTES, "queue": self._orders}
+        return Input(self._node, grid.topic, INCOMING["grid"], take, **how)
 
     # --- services -------------------------------------------------------------------------------------------------
 
-    def _serve_order(self, name: str, *, resumes: bool) -> None:
+    def _serve_order(self, row: TopicRow) -> None:
         """A Trigger which answers when the order is on a keeper's disk, and says who obeys."""
         orders = self._swarm.orders()
 
         def answer(request: Any, reply: Callable[[Any], None]) -> None:
             def respond(done: bool, sentence: str) -> None:
-                reply(self._node.types.make(f"{_TRIGGER}_Response", success=done, message=sentence))
+                reply(self._node.types.make(row.type_name + RESPONSE, success=done, message=sentence))
 
             def give() -> None:
-                told = orders.resume() if resumes else orders.pause()
+                told = orders.resume() if row.name == "resume" else orders.pause()
                 silent = f", no reply from: {', '.join(told.silent)}" if told.silent else ""
                 respond(True, f"obeyed by {number_of(len(told.obeyed), 'process')}{silent}")
 
-            if not self._orders.give(name, give, lambda why: respond(False, why)):
+            if not self._orders.give(row.topic, give, lambda why: respond(False, why)):
                 respond(False, "too many orders wait already")
 
-        self._node.serve(name, _TRIGGER, answer)
+        self._node.serve(row.topic, row, answer)

@@ -7,16 +7,15 @@ import math
 import time
 from collections import deque
 from collections.abc import Callable
-from contextlib import suppress
+from dataclasses import replace
 from typing import Any
 
 from launch_scripts.gateways.ros2.gateway_settings import Robots
 from launch_scripts.gateways.ros2.incoming.ros_places import FrameReader, Place, Track
-from launch_scripts.gateways.ros2.rmw import Qos
 from launch_scripts.gateways.ros2.ros_messages import Level, RosMessages
-from launch_scripts.gateways.ros2.ros_node import Input, Node, Publisher, WorkQueue
-from launch_scripts.gateways.ros2.topic_table import POSE_TYPES, ROBOT
-from swarm.client import BusError, ConfigError, Route, Stream, Swarm, SwarmError, Vehicle
+from launch_scripts.gateways.ros2.ros_node import Input, Node, WorkQueue
+from launch_scripts.gateways.ros2.topic_table import INCOMING, POSE_TYPES, ROBOT
+from swarm.client import ConfigError, Route, Stream, Swarm, SwarmError, Vehicle
 from swarm.clock import NS_PER_S
 
 log = logging.getLogger(__name__)
@@ -26,12 +25,7 @@ _PATIENCE_S = 5.0
 MOST_ASKED = 64
 ROUTE_THREADS = 16
 """A route takes milliseconds; only one whose planner is busy or missing takes as long as `_PATIENCE_S`."""
-Answer = Callable[[Route | str], None]
-"""Takes a route, or the reason why there is none. Called on a thread of the queue, or at once."""
-_GOAL_HZ = 10.0
-"""A robot is given no more goals; of several the newest counts."""
 _MOST_POSTED = 64
-_POSE = "geometry_msgs/msg/PoseStamped"
 _TARGET_FRAMES = "targets/"
 """A goal in the frame "targets/ID" is the target itself, wherever it is."""
 
@@ -72,13 +66,14 @@ class Robot:
         """Cell of the last published goal_pose."""
         self._posted: deque[Callable[[], None]] = deque(maxlen=_MOST_POSTED)
         """Work for the next tick."""
-        self._poses = Input(node, self.topic, POSE_TYPES[robots.type], robots.hz, self._hear_pose, qos=Qos.SENSOR)
-        self._goals = Input(node, own(robots.goal), _POSE, _GOAL_HZ, self._hear_goal)
-        self._plan = node.publisher(own(robots.plan), "nav_msgs/msg/Path", Qos.LATCHED)
-        status = "diagnostic_msgs/msg/DiagnosticStatus"
-        self._certificate = node.publisher(f"/{id}/plan_certificate", status, Qos.LATCHED)
-        self._goal_out = node.publisher(own(robots.goal), _POSE)
-        self._service = node.serve(f"/{id}/get_plan", "nav_msgs/srv/GetPlan", self._answer_plan)
+        pose = replace(INCOMING["robot"], type_name=POSE_TYPES[robots.type], hz=robots.hz)
+        certificate, get_plan = INCOMING["certificate"], INCOMING["get_plan"]
+        self._poses = Input(node, self.topic, pose, self._hear_pose)
+        self._goals = Input(node, own(robots.goal), INCOMING["goal"], self._hear_goal)
+        self._plan = node.publisher(own(robots.plan), INCOMING["robot_plan"])
+        self._certificate = node.publisher(own(certificate.topic), certificate)
+        self._goal_out = node.publisher(own(robots.goal), INCOMING["robot_goal"])
+        self._service = node.serve(own(get_plan.topic), get_plan, self._answer_plan)
 
     @property
     def present(self) -> bool:
@@ -103,10 +98,9 @@ class Robot:
     def close(self) -> None:
         """Takes it away, with all that was declared for it."""
         self._leave()
-        self._poses.close()
-        self._goals.close()
-        for endpoint in (self._plan.endpoint, self._certificate.endpoint, self._goal_out.endpoint, self._service):
-            self._node.remove(endpoint)
+        for each in (self._poses, self._goals, self._plan, self._certificate, self._goal_out):
+            self._node.remove(each.endpoint)
+        self._node.remove(self._service)
 
     # --- where it is --------------------------------------------------------------------------------------------
 
@@ -169,7 +163,7 @@ class Robot:
                 self._follow("cell:{},{}".format(*frame.grid.row_col(goal)))
                 self._goal = goal
                 if goal != before:  # no robot goes on by the plan to another goal
-                    self._put(self._plan, self._messages.path(time.time_ns(), ()))
+                    self._plan.put(self._messages.path(time.time_ns(), ()))
         except SwarmError as error:
             self._put_plan(str(error))
             self._follow(self._robots.target)
@@ -182,49 +176,41 @@ class Robot:
         end = route.cells[-1] if route.ok and route.remaining_s == 0 else None
         if self._goal is None and end is not None and end != self._goal_cell:
             self._goal_cell = end
-            pose = self._messages.pose_stamped(time.time_ns(), *self._swarm.frame.centre_m(end))
-            self._put(self._goal_out, pose)
+            place = self._swarm.frame.centre_m(end)
+            self._goal_out.put(self._messages.pose_stamped(time.time_ns(), *place))
 
     def _put_plan(self, found: Route | str) -> None:
         path, certificate = plan_of(self._messages, self.id, found)
-        self._put(self._plan, path)
-        self._put(self._certificate, certificate)
-
-    def _put(self, publisher: Publisher, message: Any) -> None:
-        """Messages are lost while the link is down."""
-        with suppress(BusError):
-            publisher.put(message)
+        self._plan.put(path)
+        self._certificate.put(certificate)
 
     # --- questions ----------------------------------------------------------------------------------------------
 
     def _answer_plan(self, request: Any, reply: Callable[[bytes], None]) -> None:
         """On a thread of ROS: never waits, always replies."""
+        swarm = self._swarm
+        how: dict[str, Any] = {"vehicle_class": self._robots.vehicle_class, "timeout_s": _PATIENCE_S}
 
         def answer(found: Route | str) -> None:
             path, certificate = plan_of(self._messages, self.id, found)
             reply(path)
-            self._posted.append(lambda: self._put(self._certificate, certificate))
+            self._posted.append(lambda: self._certificate.put(certificate))
+
+        def find() -> None:
+            """Asks for the route to a target, wherever it is, or to a place."""
+            if isinstance(goal, str):
+                answer(swarm.route_soon(goal, start.x_m, start.y_m, **how).result())
+            else:
+                answer(swarm.route((start.x_m, start.y_m), (goal.x_m, goal.y_m), **how))
 
         what = "start"
         try:
             start = self._start_of(request.start)
             what = "goal"
             goal = _target_frame(request.goal) or self._reader.pose(request.goal.header, request.goal.pose)
-            self._find_route(goal, start, answer)
         except ConfigError as error:
             answer(f"{what}: {error}")
-
-    def _find_route(self, goal: Place | str, start: Place, answer: Answer) -> None:
-        """Asks for the route to a target, wherever it is, or to a place."""
-        swarm = self._swarm
-        how: dict[str, Any] = {"vehicle_class": self._robots.vehicle_class, "timeout_s": _PATIENCE_S}
-
-        def find() -> None:
-            if isinstance(goal, str):
-                answer(swarm.route_soon(goal, start.x_m, start.y_m, **how).result())
-            else:
-                answer(swarm.route((start.x_m, start.y_m), (goal.x_m, goal.y_m), **how))
-
+            return
         if not self._routes.give("a question for a route", find, answer):
             answer(f"{MOST_ASKED} questions wait already")
 
