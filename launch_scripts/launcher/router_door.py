@@ -9,10 +9,11 @@ reach Zenoh.
 from __future__ import annotations
 
 import asyncio
+import contextlib
 import ipaddress
 import socket
 import threading
-from collections.abc import Coroutine, Sequence
+from collections.abc import Callable, Coroutine, Sequence
 from dataclasses import dataclass
 from typing import cast
 
@@ -116,28 +117,54 @@ def neighbourhood(host: str) -> str:
 
 
 class _End(asyncio.BufferedProtocol):
-    """One end of a connection that is passed on: what it receives goes to the other end.
+    """One end of a connection that is passed on: what it receives goes to the other end, and is kept before there
+    is one.
 
     All share one buffer, as one thread reads it: asyncio's own protocol takes 256 KiB of memory for each message.
+
+    begins  is called once it is connected
     """
 
     transport: asyncio.Transport
-    other: _End | None = None
     _buffer = memoryview(bytearray(1 << 16))
+
+    def __init__(self, begins: Callable[[_End], object] = lambda _: None) -> None:
+        self._begins = begins
+        self.other: _End | None = None
+        self.kept = b""
+        self.spoke = True
+        """True until the other end replies."""
+        self.replies = 0
+        self.ended = False
+        self._news = asyncio.Event()
+
+    async def until(self, done: Callable[[], bool]) -> None:
+        """Returns once something is so, or this end is closed."""
+        while not (self.ended or done()):
+            self._news.clear()
+            await self._news.wait()
 
     def get_buffer(self, sizehint: int) -> memoryview:
         return self._buffer
 
     def buffer_updated(self, nbytes: int) -> None:
-        self.received(bytes(self._buffer[:nbytes]))
+        data = bytes(self._buffer[:nbytes])
+        self.spoke = True
+        if self.other is None:
+            self.kept += data
+            self._news.set()
+            if len(self.kept) > 2 * MOST_HELLO_BYTES:
+                self.transport.abort()
+            return
+        self.other.transport.write(data)
+        if self.other.spoke:
+            self.other.spoke = False
+            self.replies += 1
+            self.other._news.set()
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         self.transport = cast(asyncio.Transport, transport)
-
-    def received(self, data: bytes) -> None:
-        """Passes data on."""
-        if self.other is not None:
-            self.other.transport.write(data)
+        self._begins(self)
 
     def pause_writing(self) -> None:
         if self.other is not None:
@@ -148,110 +175,10 @@ class _End(asyncio.BufferedProtocol):
             self.other.transport.resume_reading()
 
     def connection_lost(self, error: Exception | None) -> None:
+        self.ended = True
+        self._news.set()
         if self.other is not None:
             self.other.transport.close()
-
-
-class _Visitor(_End):
-    """A connection from outside."""
-
-    def __init__(self, door: Door) -> None:
-        self._door = door
-        self._head = b""
-        self._address: str | None = None
-        """Once it is passed on."""
-        self._proved = False
-        self._spoke = True
-        self._turns = 0
-        """Number of replies of the router."""
-
-    def connection_made(self, transport: asyncio.BaseTransport) -> None:
-        super().connection_made(transport)
-        self._door.accepted(self)
-        asyncio.get_running_loop().call_later(HELLO_WITHIN_S, self._cut_if_slow)
-
-    def received(self, data: bytes) -> None:
-        self._spoke = True
-        if self.other is not None:
-            self.other.transport.write(data)
-        elif not self.transport.is_closing():
-            self._head += data
-            self._knock()
-
-    def _knock(self) -> None:
-        """Takes note of a whole ClientHello. It is passed on unless its sender hangs up at once."""
-        try:
-            if missing_of_hello(self._head):
-                return
-        except ValueError:
-            self.transport.abort()
-            return
-        if self._door.waiting.pop(self, self) is None:
-            asyncio.get_running_loop().call_later(_HANGS_UP_WITHIN_S, self._pass_on)
-        elif len(self._head) > 2 * MOST_HELLO_BYTES:
-            self.transport.abort()
-
-    def _pass_on(self) -> None:
-        if self.transport.is_closing():
-            return
-        loop = asyncio.get_running_loop()
-        address = neighbourhood(self.transport.get_extra_info("peername")[0])
-        if not self._door.knocks.admits(address, loop.time()):
-            self.transport.abort()
-            return
-        self._address = address
-        self.transport.pause_reading()
-        self._door.keep(loop.create_task(self._join()))
-        loop.call_later(PROVED_AFTER_S, self._prove)
-
-    async def _join(self) -> None:
-        try:
-            _, inner = await asyncio.get_running_loop().create_connection(lambda: _Inner(self), *self._door.inner)
-        except OSError:  # the router reopens its session, for which no visitor is to blame
-            self._prove()
-            self.transport.abort()
-            return
-        inner.other, self.other = self, inner
-        if self.transport.is_closing():
-            inner.transport.abort()
-            return
-        inner.transport.write(self._head)
-        self.transport.resume_reading()
-
-    def replied(self) -> None:
-        """Takes note that the router has sent something."""
-        if self._spoke:
-            self._spoke = False
-            self._turns += 1
-            if self._turns == PROVED_BY_REPLIES:
-                self._prove()
-
-    def _cut_if_slow(self) -> None:
-        if self in self._door.waiting:
-            self.transport.abort()
-
-    def _prove(self) -> None:
-        if self._address is not None and not self._proved:
-            self._proved = True
-            self._door.knocks.proved(self._address)
-
-    def connection_lost(self, error: Exception | None) -> None:
-        super().connection_lost(error)
-        self._door.left(self)
-        if self._address is not None:
-            self._door.knocks.ended(self._address, self._proved, asyncio.get_running_loop().time())
-            self._address = None
-
-
-class _Inner(_End):
-    """A connection to the router's own listener."""
-
-    def __init__(self, visitor: _Visitor) -> None:
-        self._visitor = visitor
-
-    def received(self, data: bytes) -> None:
-        self._visitor.transport.write(data)
-        self._visitor.replied()
 
 
 class Door:
@@ -263,13 +190,13 @@ class Door:
     def __init__(self, places: Sequence[tuple[str, int]], inner: tuple[str, int]) -> None:
         self.inner = inner
         self.knocks = Knocks()
-        self.waiting: dict[_Visitor, None] = {}
+        self.waiting: dict[_End, None] = {}
         """Connections without a whole ClientHello, the oldest first."""
-        self._open: set[_Visitor] = set()
+        self._visits: dict[_End, asyncio.Task[None]] = {}
+        """All connections from outside."""
         self.places: list[tuple[str, int]] = []
         """Host and port of each socket that listens."""
         self._servers: list[asyncio.Server] = []
-        self._tasks: set[asyncio.Task[None]] = set()
         self._loop = asyncio.new_event_loop()
         self._thread = threading.Thread(target=self._loop.run_forever, name="door", daemon=True)
         self._thread.start()
@@ -294,36 +221,65 @@ class Door:
     async def _listen(self, host: str, port: int) -> None:
         if host == "::":  # of both protocols, as Zenoh listens; asyncio would leave IPv4 out
             listening = socket.create_server((host, port), family=socket.AF_INET6, dualstack_ipv6=True)
-            server = await self._loop.create_server(lambda: _Visitor(self), sock=listening, backlog=_BACKLOG)
+            server = await self._loop.create_server(lambda: _End(self._accepted), sock=listening, backlog=_BACKLOG)
         else:
-            server = await self._loop.create_server(lambda: _Visitor(self), host, port, backlog=_BACKLOG)
+            server = await self._loop.create_server(lambda: _End(self._accepted), host, port, backlog=_BACKLOG)
         self._servers.append(server)
         self.places += [each.getsockname()[:2] for each in server.sockets]
 
     async def _end(self) -> None:
         for server in self._servers:
             server.close()
-        for visitor in self._open:
+        for visitor, visit in self._visits.items():
             visitor.transport.abort()
-        await asyncio.sleep(0)
+            visit.cancel()
+        await asyncio.gather(*self._visits.values(), return_exceptions=True)
 
-    # --- what its connections tell, on the door's own thread
-
-    def keep(self, task: asyncio.Task[None]) -> None:
-        """Holds a task until it has ended, as its loop does not."""
-        self._tasks.add(task)
-        task.add_done_callback(self._tasks.discard)
-
-    def accepted(self, visitor: _Visitor) -> None:
-        """Takes note of a new connection."""
+    def _accepted(self, visitor: _End) -> None:
         if len(self.waiting) >= MOST_WAITING:
             oldest = next(iter(self.waiting))
             del self.waiting[oldest]
             oldest.transport.abort()
         self.waiting[visitor] = None
-        self._open.add(visitor)
+        self._visits[visitor] = self._loop.create_task(self._visit(visitor))
 
-    def left(self, visitor: _Visitor) -> None:
-        """Takes note that a connection has ended."""
-        self.waiting.pop(visitor, None)
-        self._open.discard(visitor)
+    async def _visit(self, visitor: _End) -> None:
+        """Passes a connection on once it has sent a whole ClientHello, unless its sender hangs up at once."""
+        try:
+            async with asyncio.timeout(HELLO_WITHIN_S):
+                await visitor.until(lambda: not missing_of_hello(visitor.kept))
+            self.waiting.pop(visitor, None)
+            await asyncio.sleep(_HANGS_UP_WITHIN_S)
+            if not visitor.ended:
+                await self._pass_on(visitor)
+        except (TimeoutError, ValueError):
+            visitor.transport.abort()
+        finally:
+            self.waiting.pop(visitor, None)
+            del self._visits[visitor]
+
+    async def _pass_on(self, visitor: _End) -> None:
+        """Connects it to the router, if its address has tries left, and learns whether it has a certificate."""
+        address = neighbourhood(visitor.transport.get_extra_info("peername")[0])
+        if not self.knocks.admits(address, self._loop.time()):
+            visitor.transport.abort()
+            return
+        visitor.transport.pause_reading()
+        inner, is_proved = _End(), True
+        inner.other = visitor
+        try:
+            await self._loop.create_connection(lambda: inner, *self.inner)
+        except OSError:  # the router reopens its session, for which no visitor is to blame
+            visitor.transport.abort()
+        else:
+            visitor.other = inner
+            inner.transport.write(visitor.kept)
+            visitor.transport.resume_reading()
+            proves = visitor.until(lambda: inner.replies >= PROVED_BY_REPLIES)
+            with contextlib.suppress(TimeoutError):
+                await asyncio.wait_for(proves, PROVED_AFTER_S)
+            is_proved = inner.replies >= PROVED_BY_REPLIES or not visitor.ended
+        if is_proved:
+            self.knocks.proved(address)
+        await visitor.until(lambda: False)
+        self.knocks.ended(address, is_proved, self._loop.time())
