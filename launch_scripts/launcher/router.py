@@ -85,25 +85,17 @@ class Admission:
 
     def __init__(self, network: NetworkConfig) -> None:
         self._authenticator = authenticator_of(network, "")  # a router belongs to no run
-        self._door, network = behind_door(network)
-        self._network = network
-        self._admitting = with_revocations(network)
+        self._door, self._network = behind_door(network)
+        self._admitting = with_revocations(self._network)
         self._failure = ""
         """Reason why the file of revoked names could not be read at the last look."""
-        try:
-            self.bus = open_bus(self._admitting, mode="router", authenticator=self._authenticator)
-        except BaseException:
-            self._close_door()
-            raise
+        self.bus = self._opened(within_s=0.0)
 
     def close(self) -> None:
         """Leaves the network."""
-        self._close_door()
-        self.bus.close()
-
-    def _close_door(self) -> None:
         if self._door is not None:
             self._door.close()
+        self.bus.close()
 
     def reopened(self) -> ZenohBus | None:
         """The new session, if one was opened. If the list cannot be read, the previous one stays in force."""
@@ -120,11 +112,11 @@ class Admission:
         log.warning("revoked names: %s; reopening the session", ", ".join(admitting.revoked) or "none")
         self._admitting = admitting
         self.bus.close()
-        self.bus = self._open()
+        self.bus = self._opened(_OPEN_WITHIN_S)
         return self.bus
 
-    def _open(self) -> ZenohBus:
-        until_s = time.monotonic() + _OPEN_WITHIN_S
+    def _opened(self, within_s: float) -> ZenohBus:
+        until_s = time.monotonic() + within_s
         while True:
             try:
                 return open_bus(self._admitting, mode="router", authenticator=self._authenticator)

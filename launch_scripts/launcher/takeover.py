@@ -92,8 +92,7 @@ class TakeOver:
             return
         self._asked = True
         # Once more: a process to follow that has crashed meanwhile runs in a new generation, or is gone.
-        own = [each.process.pid for each in self._running if each.process is not None]
-        self.predecessors = processes(self._run_dir, [pid for pid in own if pid is not None])
+        self.predecessors = processes(self._run_dir, [each.pid for each in self._running])
 
     def _is_free(self, name: str) -> bool:
         """Returns True if the exclusive resources of a process are free. The old launcher restarts crashed
@@ -132,7 +131,7 @@ def _launcher_of(run_dir: Path) -> int:
     return found[0]
 
 
-def processes(run_dir: Path, other_than: Collection[int] = ()) -> dict[str, int]:
+def processes(run_dir: Path, other_than: Collection[int | None] = ()) -> dict[str, int]:
     """Name -> pid of the processes that log into a run's folder; the launcher itself is not among them."""
     found = logging_into(run_dir)
     return {name: pid for name, pid in found.items() if name.startswith(_NAMES) and pid not in other_than}

@@ -93,12 +93,9 @@ class Watcher(RunObserver):
         self._inbox = Inbox()
         # The first route tells that routes are served, sooner than any figures do.
         hears = _OF_PART if isinstance(known, OwnPart) else {**RECORDED, FOLLOWED: 0.0}
-        self._everywhere = list(hears)
         super().__init__(bus, self._inbox.post, known, {STATS: 0.0, NOTE: 0.0, **hears})
-
-    def begin(self) -> None:
-        self.keep_samples(self._everywhere)
-        if not isinstance(self.known, OwnPart):
+        self.keep_samples(list(hears))
+        if not isinstance(known, OwnPart):
             self.ask_gone()  # of a run that this is a part of
 
     def look_after(self, processes: Collection[ProcessSpec]) -> None:
