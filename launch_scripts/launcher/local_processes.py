@@ -169,6 +169,10 @@ class LocalSwarm:
         self._context = multiprocessing.get_context("forkserver")
 
     @property
+    def alive(self) -> list[Running]:
+        return [running for running in self.running if running.alive]
+
+    @property
     def restarts(self) -> int:
         return sum(running.restarts for running in self.running)
 
@@ -255,9 +259,7 @@ class LocalSwarm:
                 running.send(signal.SIGKILL)
 
     def stop(
-        self,
-        while_waiting: Callable[[], None] = lambda: None,
-        force: Callable[[], bool] = lambda: False,
+        self, while_waiting: Callable[[], None] = lambda: None, force: Callable[[], bool] = lambda: False
     ) -> list[str]:
         """Ends all processes, role by role: by SIGKILL those which still run after `STOP_GRACE_S`. Returns a
         sentence for each process that did not end as asked.
@@ -282,24 +284,21 @@ class LocalSwarm:
                 lambda: all(each.ended_as_asked or each.exitcode is not None for each in processes), within_s, force
             )
 
-        def still_running() -> list[Running]:
-            return [running for running in self.running if running.alive]
-
         for running in self.running:
             running.due_s = running.begins_when = None
         failures = []
         for role in STOP_ORDER:
-            of_role = [running for running in still_running() if running.spec.role == role]
+            of_role = [running for running in self.alive if running.spec.role == role]
             if of_role and not force():
                 ask(of_role, STOP_GRACE_S)
                 failures += [said for running in of_role if (said := self._failure(running, force())) is not None]
-        leaving = [running for running in still_running() if running.ended_as_asked]
+        leaving = [running for running in self.alive if running.ended_as_asked]
         wait_until(lambda: all(each.exitcode is not None for each in leaving), STOP_GRACE_S)
         for running in leaving:
             if running.exitcode is None:
                 log.warning("%s has ended and does not leave: %s", running.spec.name, sight_of(running.pid))
             running.end()
-        left = still_running()
+        left = self.alive
         ask(left, FORCED_GRACE_S, lambda: False)
         for running in left:
             if running.exitcode is None:

@@ -66,15 +66,15 @@ class StopAsked:
         """Exit code of a run that a signal ended, as shells have it: 128 and the signal's number."""
         return 128 + (self.number or 0)
 
-    def interruptible(self, work: Callable[[], T], *, once_more: bool = False) -> T | None:
+    def interruptible(self, work: Callable[[], T], *, anew: bool = False) -> T | None:
         """The result of `work`, or None if a signal has left it, or came before: for what takes long while there is
         no process to be ended.
 
-        once_more  earlier signals do not count: only a further SIGINT or SIGTERM interrupts the work
+        anew  earlier signals do not count: only a further SIGINT or SIGTERM interrupts the work
         """
         most = max(self._times, 1)
         try:
-            self._leaves = (lambda: self._times > most) if once_more else self.__bool__
+            self._leaves = (lambda: self._times > most) if anew else self.__bool__
             return None if self._leaves() else work()
         except KeyboardInterrupt:
             return None

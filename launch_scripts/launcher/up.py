@@ -92,9 +92,8 @@ def _run_id_of(options: run_options.UpOptions) -> tuple[str, int | None]:
     found: list[RunInfo] = []
     if options.joins or options.takes_over:
         log_to(None, options.log_format)  # it may have to wait, and says so
-        found = [
-            info for info in find_members(run_options.as_process(options.scenario, LAUNCHER, "0")) if info.run_id
-        ]
+        members = find_members(run_options.as_process(options.scenario, LAUNCHER, "0"))
+        found = [info for info in members if info.run_id]
     run_id = options.run_id
     if run_id is None and options.is_whole and not options.takes_over:
         run_id = run_options.new_run_id()
@@ -121,8 +120,6 @@ class _Run:
         self.begun = False
         """True if everything that can be refused before a process starts has been accepted."""
         self._startup_s: float | None = None
-        self._up_at_s: float | None = None
-        """time.monotonic() when the swarm was whole."""
         self._web_port = 0
         self._outlasts = False
         """True while the run goes on for a viewer only."""
@@ -137,8 +134,7 @@ class _Run:
         """The live view's start page, until the monitor serves it."""
         view = options.scenario.monitor
         if "monitor" in options.roles and view.live and view.web_port and not options.takes_over:
-            name = f"{self._scenario.name}, run {run_id}"
-            told = {"life": "", "at_s": 0.0, "name": name}
+            told = {"life": "", "at_s": 0.0, "name": f"{self._scenario.name}, run {run_id}"}
             self._page = when_free(lambda: LivePage(view.web_port, lambda: {**told, "state": self._doing()}))
             self._say_page(view.web_port)
         if self._signals.url:
@@ -317,7 +313,7 @@ class _Run:
             now_s = time.monotonic()
             if self._startup_s is None and self._is_up(watcher):
                 self._startup_s = now_s - self._options.began_s
-                self._up_at_s = began_s = now_s
+                began_s = now_s
                 served = watcher.routes_served or not self._all_external
                 so_far = "routes are served" if served else "targets wait for their trackers"
                 so_far += f", {self._startup_s:.1f} s after launch{self._limit('; the run lasts')}"
@@ -337,8 +333,7 @@ class _Run:
     def _is_up(self, watcher: Watcher) -> bool:
         if self._missing(watcher) or (self._take_over is not None and not self._take_over.done):
             return False
-        planners = "planner" in self._options.roles
-        return not planners or watcher.routes_served or self._all_external
+        return "planner" not in self._options.roles or watcher.routes_served or self._all_external
 
     @property
     def _all_external(self) -> bool:
@@ -386,8 +381,8 @@ class _Run:
     def _title(self, up: str, missing: list[str]) -> str:
         """Returns the title line of the displays. Its time is that of the start-up, and then that of the run, as
         the numbers at the end have them."""
-        since_s = time.monotonic() - (self._up_at_s or self._options.began_s)
-        if self._up_at_s is None:
+        since_s = time.monotonic() - self._options.began_s - (self._startup_s or 0.0)
+        if self._startup_s is None:
             waits = f", waits for {', '.join(missing) or 'the whole swarm'}" * (len(missing) < 4)
             return f"{self._scenario.name}: starting, {up} processes are up{waits}, {since_s:.0f} s"
         of = "" if self._outlasts else self._limit(" of")
@@ -406,10 +401,9 @@ class _Run:
                 error.exit_code = ending.exit_code
                 raise error
             if ending.times <= 3 or ending.times % 10 == 0:
-                again = f"starts again in {ending.restart_in_s:g} s" + (
-                    f", time {ending.times}" * (ending.times > 1)
-                )
-                self._terminal.say(f"{ending.spec.name}: {ending.sentence}; {again}", "yellow")
+                again = f"starts again in {ending.restart_in_s:g} s"
+                times = f", time {ending.times}" if ending.times > 1 else ""
+                self._terminal.say(f"{ending.spec.name}: {ending.sentence}; {again}{times}", "yellow")
 
     def _stop(self, watcher: Watcher) -> list[str]:
         """Stops all roles in order, and records their last messages."""
@@ -417,24 +411,22 @@ class _Run:
         self._terminal.close()
         asked = "; once more, and what still runs is killed" if self._stop_asked else ""
         self._terminal.say(f"stopping{asked}")
-        watcher.end([running.spec for running in self._swarm.running])
-        with self._terminal.busy(self._stopping):
-            failures = self._swarm.stop(lambda: watcher.listen(_TURN_S), force=self._stop_asked.force)
+        swarm = self._swarm
+        watcher.end([running.spec for running in swarm.running])
+        with self._terminal.busy(
+            lambda: f"stopping: {len(swarm.alive)} of {len(swarm.running)} processes still run"
+        ):
+            failures = swarm.stop(lambda: watcher.listen(_TURN_S), force=self._stop_asked.force)
             watcher.finish()
-        if names := self._swarm.cut_short:
+        if names := swarm.cut_short:
             self._terminal.say(f"killed, as asked: {', '.join(names)}", "yellow")
         return failures
-
-    def _stopping(self) -> str:
-        alive = sum(running.alive for running in self._swarm.running)
-        return f"stopping: {alive} of {len(self._swarm.running)} processes still run"
 
     def _end(self, known: Recorder | OwnPart, seconds: float, failures: list[str]) -> int:
         """Writes what the run leaves, and says where it is. Returns 0 if it is whole and nothing was cut short."""
         try:
             with self._terminal.busy("writing the report and its picture"):
-                report = lambda: self._report(known, seconds, failures)  # noqa: E731
-                whole = self._stop_asked.interruptible(report, once_more=True)
+                whole = self._stop_asked.interruptible(lambda: self._report(known, seconds, failures), anew=True)
         except StoreError as error:
             self._terminal.say(str(error), "red")
             return error.exit_code
