@@ -159,7 +159,8 @@ class _End(asyncio.BufferedProtocol):
         if self.other.spoke:
             self.other.spoke = False
             self.replies += 1
-            self.other._news.set()
+            if self.replies == PROVED_BY_REPLIES:
+                self.other._news.set()
 
     def connection_made(self, transport: asyncio.BaseTransport) -> None:
         self.transport = cast(asyncio.Transport, transport)
@@ -236,22 +237,27 @@ class Door:
 
     def _accepted(self, visitor: _End) -> None:
         if len(self.waiting) >= MOST_WAITING:
-            oldest = next(iter(self.waiting))
-            del self.waiting[oldest]
-            oldest.transport.abort()
+            self._cut(next(iter(self.waiting)))
         self.waiting[visitor] = None
+        self._loop.call_later(HELLO_WITHIN_S, self._cut, visitor)
         self._visits[visitor] = self._loop.create_task(self._visit(visitor))
+
+    def _cut(self, visitor: _End) -> None:
+        """Ends a connection which has not sent a whole ClientHello."""
+        if visitor in self.waiting:
+            del self.waiting[visitor]
+            visitor.transport.abort()
 
     async def _visit(self, visitor: _End) -> None:
         """Passes a connection on once it has sent a whole ClientHello, unless its sender hangs up at once."""
         try:
-            async with asyncio.timeout(HELLO_WITHIN_S):
-                await visitor.until(lambda: not missing_of_hello(visitor.kept))
+            await visitor.until(lambda: not missing_of_hello(visitor.kept))
             self.waiting.pop(visitor, None)
-            await asyncio.sleep(_HANGS_UP_WITHIN_S)
+            if not visitor.ended:
+                await asyncio.sleep(_HANGS_UP_WITHIN_S)
             if not visitor.ended:
                 await self._pass_on(visitor)
-        except (TimeoutError, ValueError):
+        except ValueError:
             visitor.transport.abort()
         finally:
             self.waiting.pop(visitor, None)
@@ -274,9 +280,9 @@ class Door:
             visitor.other = inner
             inner.transport.write(visitor.kept)
             visitor.transport.resume_reading()
-            proves = visitor.until(lambda: inner.replies >= PROVED_BY_REPLIES)
             with contextlib.suppress(TimeoutError):
-                await asyncio.wait_for(proves, PROVED_AFTER_S)
+                async with asyncio.timeout(PROVED_AFTER_S):
+                    await visitor.until(lambda: inner.replies >= PROVED_BY_REPLIES)
             is_proved = inner.replies >= PROVED_BY_REPLIES or not visitor.ended
         if is_proved:
             self.knocks.proved(address)
