@@ -10,11 +10,11 @@ import os
 import signal
 import sys
 import threading
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from pkgutil import resolve_name
-from typing import Any
+from typing import Any, NamedTuple
 
 from launch_scripts.launcher.log_file import LogFormat, Speaker, log_to
 from launch_scripts.parent_death import end_with_parent
@@ -32,8 +32,7 @@ _GRACE_S = 4.0
 less than a launcher waits (`STOP_GRACE_S`)."""
 
 
-@dataclass(frozen=True, slots=True)
-class ExitReason:
+class ExitReason(NamedTuple):
     """The last word of a process: why it ended.
 
     exit_code  0: as asked. It has left the swarm, and all its files are written; the rest of its end is the

@@ -14,7 +14,7 @@ from dataclasses import dataclass, field, replace
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import ForkServerProcess
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from launch_scripts.launcher.child_main import ExitReason, run_child
 from launch_scripts.launcher.forkserver import without_main
@@ -43,8 +43,7 @@ FINALLY_REFUSED_WAIT_S = 60.0
 """Wait before the next start of an expendable process whose refusal is final."""
 
 
-@dataclass(frozen=True, slots=True)
-class Ending:
+class Ending(NamedTuple):
     """End of a process that was not asked to end.
 
     sentence      why it ended

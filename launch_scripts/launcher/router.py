@@ -81,11 +81,18 @@ class RouterService(MemberService):
 
 
 class Admission:
-    """The router's session, reopened whenever the list of revoked names changes."""
+    """The router's session, behind a door at its `tls/` endpoints, and reopened whenever the list of revoked names
+    changes. Raises BusError if it cannot listen."""
 
     def __init__(self, network: NetworkConfig) -> None:
         self._authenticator = authenticator_of(network, "")  # a router belongs to no run
-        self._door, self._network = behind_door(network)
+        self._network, self._door = network, None
+        if outside := [endpoint for endpoint in network.listen if endpoint.startswith("tls/")]:
+            inner = LOOPBACK, free_ports(1)[0]
+            self._door = Door([host_port(each) for each in outside], inner)
+            within = f"tls/{inner[0]}:{inner[1]}#tls_handshake_timeout_ms={HANDSHAKE_S * 1000:.0f}"
+            others = tuple(each for each in network.listen if each not in outside)
+            self._network = msgspec.structs.replace(network, listen=(*others, within))
         self._admitting = with_revocations(self._network)
         self._failure = ""
         """Reason why the file of revoked names could not be read at the last look."""
@@ -124,19 +131,6 @@ class Admission:
                 if time.monotonic() > until_s:
                     raise
                 time.sleep(0.05)
-
-
-def behind_door(network: NetworkConfig) -> tuple[Door | None, NetworkConfig]:
-    """A door at the `tls/` endpoints of a router, if it has any, and the network as the router listens then. Raises
-    BusError if it cannot listen."""
-    outside = [endpoint for endpoint in network.listen if endpoint.startswith("tls/")]
-    if not outside:
-        return None, network
-    inner = LOOPBACK, free_ports(1)[0]
-    door = Door([host_port(each) for each in outside], inner)
-    within = f"tls/{inner[0]}:{inner[1]}#tls_handshake_timeout_ms={HANDSHAKE_S * 1000:.0f}"
-    others = tuple(each for each in network.listen if each not in outside)
-    return door, msgspec.structs.replace(network, listen=(*others, within))
 
 
 def run(setup: RoleSetup, built: Callable[[], None]) -> None:
