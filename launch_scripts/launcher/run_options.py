@@ -92,14 +92,13 @@ def with_network(
     network = scenario.network
     tls = tls or network.tls
     changes: dict[str, object] = {"tls": tls}
-    for option, endpoint, beside in (
-        ("connect", connect, ()),
-        ("listen", listen, ()),
-        ("listen", also_listen, network.listen),
-    ):
+    for option, endpoint in (("--connect", connect), ("--listen", listen)):
         if endpoint is not None:
-            check_endpoint(endpoint, tls is not None, f"--{option}")
-            changes[option] = (*beside, endpoint)
+            check_endpoint(endpoint, tls is not None, option)
+            changes[option[2:]] = (endpoint,)
+    if also_listen is not None:
+        check_endpoint(also_listen, tls is not None, "--listen")
+        changes["listen"] = (*network.listen, also_listen)
     if namespace is not None:
         changes["namespace"] = namespace
     raw = {**msgspec.to_builtins(network), **msgspec.to_builtins(changes)}
