@@ -1,9 +1,11 @@
-"""The table of processes: all that is said of a role, in one row, and the processes of a scenario."""
+"""The table of processes: all that is said of a role, in one row of `process_table.toml`, and the processes of a
+scenario."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import tomllib
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Literal
 
 import msgspec
@@ -15,13 +17,12 @@ from swarm.peers import ranked_id
 from swarm.wire.fields import check_id
 
 
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Role:
+class Role(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Properties of a role.
 
     entry       `module:function` of its `run(setup, built)`: `built` is called once the role is built
-    jobs        ids of the processes that a scenario has of it, without ranks
-    standbys    how many stand by for each of them, in ranks from 1 on; None: it has no ranks
+    standbys    key of a scenario's [standbys]: how many stand by for each process, in ranks from 1 on; None: it has
+                no ranks
     stops       place in the order of the end: each role stops after those which still talk to it
     niceness    by how much less urgent it is than the launcher, where the processor is short. A vehicle that is
                 driven late stops, and a target jumps; a route may come a little later, storing and drawing much
@@ -41,8 +42,7 @@ class Role:
     """
 
     entry: str
-    jobs: Callable[[Scenario], list[str]] = lambda _: ["0"]
-    standbys: Callable[[Scenario], int] | None = None
+    standbys: Literal["planner", "targets"] | None = None
     stops: int
     niceness: int = 0
     memory_mib: int
@@ -57,74 +57,9 @@ class Role:
     takes_over: Literal["beside", "waits", "after"] = "after"
 
 
-TABLE: dict[str, Role] = {
-    "router": Role(
-        entry="launch_scripts.launcher.router:run",
-        stops=5,
-        memory_mib=512,
-        is_needed=False,
-        simulated=False,
-        any_id=True,
-        options=("listen",),
-    ),
-    "keeper": Role(
-        entry="shared_map.keeper.main:run",
-        stops=4,
-        niceness=10,
-        memory_mib=2048,
-        photo=True,
-        any_id=True,
-        lasting=True,
-        options=("store_path", "rebuild"),
-    ),
-    "monitor": Role(
-        entry="launch_scripts.monitor.main:run",
-        stops=3,
-        niceness=5,
-        memory_mib=4096,
-        is_needed=False,
-        expendable=True,
-        photo=True,
-        simulated=False,
-        lasting=True,
-    ),
-    "planner": Role(
-        entry="planner_service.main:run",
-        jobs=lambda scenario: scenario.target_ids,
-        standbys=lambda scenario: scenario.standbys.planner,
-        stops=2,
-        niceness=5,
-        memory_mib=2048,
-        kernels=True,
-        takes_over="beside",
-        options=("target",),
-    ),
-    "places": Role(
-        entry="planner_service.main:run_places",
-        jobs=places_of,
-        standbys=lambda scenario: scenario.standbys.planner,
-        stops=2,
-        niceness=5,
-        memory_mib=2048,
-        kernels=True,
-        takes_over="beside",
-        options=("group",),
-    ),
-    "targets": Role(  # the referee also where all targets are external
-        entry="launch_scripts.simulation.world.main:run",
-        standbys=lambda scenario: scenario.standbys.targets,
-        stops=1,
-        memory_mib=2048,
-    ),
-    "agent": Role(
-        entry="vehicle_agent.main:run",
-        jobs=lambda scenario: [plan.id for plan in plan_agents(scenario)],
-        stops=0,
-        memory_mib=1024,
-        lasting=True,
-        takes_over="waits",
-    ),
-}
+TABLE = msgspec.convert(
+    tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8")), dict[str, Role]
+)
 """In order of start: each role finds what it needs, and the slowest to import starts early."""
 
 ROLES = tuple(TABLE)
@@ -154,6 +89,18 @@ class ProcessSpec:
         return f"{self.role}-{self.id}"
 
 
+def jobs_of(scenario: Scenario, role: str) -> list[str]:
+    """Ids of the processes that a scenario has of a role, without ranks."""
+    match role:
+        case "planner":
+            return scenario.target_ids
+        case "places":
+            return places_of(scenario)
+        case "agent":
+            return [plan.id for plan in plan_agents(scenario)]
+    return ["0"]
+
+
 def processes_of(scenario: Scenario, roles: tuple[str, ...] = ROLES, rank: int | None = None) -> list[ProcessSpec]:
     """Processes of a scenario, restricted to `roles`, in order of start.
 
@@ -163,9 +110,9 @@ def processes_of(scenario: Scenario, roles: tuple[str, ...] = ROLES, rank: int |
     for name, role in TABLE.items():
         ranks = [0]
         if role.standbys is not None:
-            ranks = [each for each in range(role.standbys(scenario) + 1) if rank in (None, each)]
+            ranks = [each for each in range(getattr(scenario.standbys, role.standbys) + 1) if rank in (None, each)]
         if name in roles:
-            found += [ProcessSpec(name, ranked_id(job, each)) for each in ranks for job in role.jobs(scenario)]
+            found += [ProcessSpec(name, ranked_id(job, each)) for each in ranks for job in jobs_of(scenario, name)]
     return found
 
 

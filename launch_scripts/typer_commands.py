@@ -97,20 +97,16 @@ def _called_with_options(function: Callable[..., int | None]) -> Callable[..., N
     parameters: list[inspect.Parameter] = []
     for each in inspect.signature(function, eval_str=True).parameters.values():
         if not is_dataclass(each.annotation):
-            parameters.append(_parameter(each.name, each.annotation, each.default, said))
+            parameters.append(_parameter(each.name, each.annotation, each.default, said.get(each.name)))
             continue
         group: Any = each.annotation
         groups[each.name] = group
         bases: list[Any] = [base for base in reversed(group.__mro__) if is_dataclass(base)]
-        explained = {name: text for base in bases for name, text in meanings(base).items()}
-        panels = {name: base.panel for base in bases for name in meanings(base)}
+        told = {name: (text, base.panel) for base in bases for name, text in meanings(base).items()}
         hints = get_type_hints(group, include_extras=True)
         for field in fields(group):
-            parameters.append(
-                _parameter(
-                    field.name, hints[field.name], field.default, explained, panels.get(field.name, group.panel)
-                )
-            )
+            text, panel = told.get(field.name, (None, group.panel))
+            parameters.append(_parameter(field.name, hints[field.name], field.default, text, panel))
 
     def run(**values: Any) -> None:
         for name, group in groups.items():
@@ -124,14 +120,12 @@ def _called_with_options(function: Callable[..., int | None]) -> Callable[..., N
     return run
 
 
-def _parameter(
-    name: str, hint: Any, default: Any, said: dict[str, str], panel: str | None = None
-) -> inspect.Parameter:
+def _parameter(name: str, hint: Any, default: Any, said: str | None, panel: str | None = None) -> inspect.Parameter:
     """A parameter with its meaning; one that is true or false is given as `--name` alone."""
     kind, *declared = (hint.__origin__, *hint.__metadata__) if hasattr(hint, "__metadata__") else (hint,)
     is_argument = default is inspect.Parameter.empty
     info = copy(declared[0]) if declared else typer.Argument() if is_argument else typer.Option()
-    info.help = said.get(name, info.help)
+    info.help = said or info.help
     info.rich_help_panel = panel
     if kind is bool and not isinstance(info.default, str):  # where Typer keeps a name that is declared
         info.param_decls = (f"--{name.replace('_', '-')}",)

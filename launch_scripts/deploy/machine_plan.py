@@ -150,7 +150,7 @@ def _check(scenario: Scenario, hosts: HostsConfig) -> None:
         "targets": (standbys.targets + 1, f"{standbys.targets} standbys of the targets process"),
     }
     for role in process_table.ROLES:
-        if process_table.TABLE[role].expendable or not process_table.TABLE[role].jobs(scenario):
+        if process_table.TABLE[role].expendable or not process_table.jobs_of(scenario, role):
             continue
         found = sum(role in host.roles for host in hosts.hosts)
         wanted, why = (1, "") if alone else apart.get(role, (1, ""))

@@ -10,11 +10,11 @@ import os
 import signal
 import sys
 import threading
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from pkgutil import resolve_name
-from typing import Any
+from typing import Any, NamedTuple
 
 from launch_scripts.launcher.log_file import LogFormat, Speaker, log_to
 from launch_scripts.parent_death import end_with_parent
@@ -32,8 +32,7 @@ _GRACE_S = 4.0
 less than a launcher waits (`STOP_GRACE_S`)."""
 
 
-@dataclass(frozen=True, slots=True)
-class ExitReason:
+class ExitReason(NamedTuple):
     """The last word of a process: why it ended.
 
     exit_code  0: as asked. It has left the swarm, and all its files are written; the rest of its end is the
@@ -54,29 +53,39 @@ def run_child(
     board  memory of a `Board`, which the launcher reads
     pipe   takes its last word, an `ExitReason`
     """
-    _redirect(log_path, log_format, setup)
+    # All output, that of native libraries included, goes to the log file: once that can be opened, for a full disk
+    # must not keep a process from its start.
+    sys.stdout.flush()
+    sys.stderr.flush()
+    discard_output(1, 2)
+    faulthandler.enable()
+    log_to(log_path, log_format, Speaker(setup.role, setup.id, setup.run_id), takes_output=True)
     setup = replace(setup, health=Health(Board(board)))
     # The launcher alone decides when to stop: it blocks SIGINT for all its processes, and SIGTERM until here.
     signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGTERM})
     end_with_parent(signal.SIGCONT)  # the forkserver ends with the launcher: one that is stopped then sees it, too
-    _watch_launcher()
+    threading.Thread(target=_end_after_launcher, name="launcher-watch", daemon=True).start()
     log = logging.getLogger(__name__)
     log.info("%s %s starts, pid %d, incarnation %d", setup.role, setup.id, os.getpid(), setup.incarnation)
+    reason = ExitReason("ended as asked", 0)
     try:
         resolve_name(entry)(setup, lambda: _give_way(TABLE[setup.role].niceness))
     except SwarmError as error:
+        reason = ExitReason(str(error), error.exit_code, refused=True)
         log.error("%s", error)
-        pipe.send(ExitReason(str(error), error.exit_code, refused=True))
-        _leave(error.exit_code)
     except BaseException as error:
+        reason = ExitReason(f"{type(error).__name__}: {error}", CRASHED)
         log.critical("crashed", exc_info=True)
-        pipe.send(ExitReason(f"{type(error).__name__}: {error}", CRASHED))
-        _leave(CRASHED)
-    # Before the log, which a disk that stalls may hold up.
+    # Before the last line of the log, which a disk that stalls may hold up.
     with contextlib.suppress(OSError):  # the launcher is gone
-        pipe.send(ExitReason("ended as asked", 0))
-    log.info("ended as asked")
-    _leave(0)
+        pipe.send(reason)
+    if not reason.exit_code:
+        log.info("%s", reason.sentence)
+    with contextlib.suppress(OSError):  # of a full disk
+        logging.shutdown()
+        sys.stdout.flush()
+        sys.stderr.flush()
+    os._exit(reason.exit_code)  # threads left waiting after a crash must not keep it alive
 
 
 def wait_for_launcher() -> None:
@@ -99,34 +108,11 @@ def _give_way(niceness: int) -> None:
             os.setpriority(os.PRIO_PROCESS, thread.id, min(now + niceness, 19))
 
 
-def _watch_launcher() -> None:
+def _end_after_launcher() -> None:
     """Ends this process after the launcher: in order where its loop turns, and in any case, also if a role hangs in
     its start."""
-
-    def watch() -> None:
-        wait_for_launcher()
-        logging.getLogger(__name__).warning("the launcher has ended: stopping")
-        os.kill(os.getpid(), signal.SIGTERM)
-        threading.Event().wait(_GRACE_S)
-        os._exit(CRASHED)
-
-    threading.Thread(target=watch, name="launcher-watch", daemon=True).start()
-
-
-def _redirect(log_path: Path, log_format: LogFormat, setup: RoleSetup) -> None:
-    """Sends all output of this process, that of native libraries included, to its log file: once that can be
-    opened, for a full disk must not keep a process from its start."""
-    sys.stdout.flush()
-    sys.stderr.flush()
-    discard_output(1, 2)
-    faulthandler.enable()
-    log_to(log_path, log_format, Speaker(setup.role, setup.id, setup.run_id), takes_output=True)
-
-
-def _leave(code: int) -> None:
-    """Ends the process now: threads left waiting after a crash must not keep it alive."""
-    with contextlib.suppress(OSError):  # of a full disk
-        logging.shutdown()
-        sys.stdout.flush()
-        sys.stderr.flush()
-    os._exit(code)
+    wait_for_launcher()
+    logging.getLogger(__name__).warning("the launcher has ended: stopping")
+    os.kill(os.getpid(), signal.SIGTERM)
+    threading.Event().wait(_GRACE_S)
+    os._exit(CRASHED)

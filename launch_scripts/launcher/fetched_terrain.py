@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
 import fcntl
 import logging
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Sequence
 from pathlib import Path
 
 from launch_scripts.check.scenario_check import files_of
@@ -79,7 +78,10 @@ def fetch_if_missing(
         )
     key = scenario_key(scenario)
     looks = any(TABLE[role].photo for role in roles)
-    with _locked(run_dir):
+    with writing(run_dir):
+        lock = (run_dir / "terrain.lock").open("wb")
+    with lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)  # one process of this machine at a time fetches
         here = load_prepared(run_dir, key)
         if here is not None and (here.photo.any() or not looks):
             costs = scenario.cost
@@ -93,13 +95,3 @@ def fetch_if_missing(
             terrain = fetch_base_map(bus, found[0].terrain, scenario.cost, why, layers, within_s, progress)
         save_prepared(run_dir, terrain, build_truth(scenario, terrain), key)
         log.info("%s; terrain %s is as in the run", terrain.notes[-1], terrain.digest)
-
-
-@contextlib.contextmanager
-def _locked(run_dir: Path) -> Iterator[None]:
-    """Makes one process at a time fetch into a run's folder."""
-    with writing(run_dir):
-        lock = (run_dir / "terrain.lock").open("wb")
-    with lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        yield

@@ -83,10 +83,7 @@ class WarmUp:
         self._lock = threading.Lock()
         self._closed = False
         """Set for good by `close`: no builder is started any more. The lock guards both."""
-        self._thread = threading.Thread(target=self._run, name="warm-up", daemon=True)
-
-    def begin(self) -> None:
-        self._thread.start()
+        threading.Thread(target=self._run, name="warm-up", daemon=True).start()
 
     def done(self, timeout_s: float) -> bool:
         """Returns True if processes may be started: all modules are loaded, and the kernels of a first route are

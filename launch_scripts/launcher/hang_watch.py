@@ -75,12 +75,12 @@ class Stillness:
         return self.still_s >= STILL_S
 
 
-def sight_of(pid: int) -> Sight | None:
+def sight_of(pid: int | None) -> Sight | None:
     """Returns the main thread of a process as the system shows it; None if there is none."""
     import psutil  # the launcher needs none to start
 
     with contextlib.suppress(psutil.Error):
-        process = psutil.Process(pid)
+        process = psutil.Process(pid or 0)
         used_s = next((each.user_time + each.system_time for each in process.threads() if each.id == pid), 0.0)
         return Sight(used_s, process.status() == psutil.STATUS_RUNNING)
     return None

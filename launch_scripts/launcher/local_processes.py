@@ -9,12 +9,12 @@ import multiprocessing
 import os
 import signal
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass, field, replace
 from multiprocessing.connection import Connection, wait
 from multiprocessing.context import ForkServerProcess
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from launch_scripts.launcher.child_main import ExitReason, run_child
 from launch_scripts.launcher.forkserver import without_main
@@ -43,23 +43,7 @@ FINALLY_REFUSED_WAIT_S = 60.0
 """Wait before the next start of an expendable process whose refusal is final."""
 
 
-@dataclass(slots=True)
-class Backoff:
-    """Wait before the next start: doubled at each crash, short again after a long run."""
-
-    wait_s: float = FIRST_WAIT_S
-
-    def crashed(self, ran_s: float) -> float:
-        """Seconds to wait now."""
-        if ran_s >= SETTLED_S:
-            self.wait_s = FIRST_WAIT_S
-        wait_s = self.wait_s
-        self.wait_s = min(2 * self.wait_s, LONGEST_WAIT_S)
-        return wait_s
-
-
-@dataclass(frozen=True, slots=True)
-class Ending:
+class Ending(NamedTuple):
     """End of a process that was not asked to end.
 
     sentence      why it ended
@@ -88,7 +72,8 @@ class Running:
     restarts: int = 0
     refused_s: list[float] = field(default_factory=list)
     """Time when it refused to run, within the last `REFUSALS_WITHIN_S`."""
-    backoff: Backoff = field(default_factory=Backoff)
+    wait_s: float = FIRST_WAIT_S
+    """Wait before the next start after a crash."""
     begins_when: Callable[[], bool] | None = None
     """Condition of its first start; None once it has been started, or without a condition."""
     takes_over: bool = False
@@ -100,6 +85,12 @@ class Running:
     stillness: Stillness = field(default_factory=Stillness)
     hung_s: float | None = None
     """Since when this generation has been asked to say where it hangs, and to end; None if it has not."""
+
+    def crashed(self, ran_s: float) -> float:
+        """Seconds to wait before the next start: twice as long at each crash, short again after a long run."""
+        wait_s = FIRST_WAIT_S if ran_s >= SETTLED_S else self.wait_s
+        self.wait_s = min(2 * wait_s, LONGEST_WAIT_S)
+        return wait_s
 
     @property
     def alive(self) -> bool:
@@ -117,25 +108,25 @@ class Running:
         """Exit code of an ended process; None as long as it runs, or if there is none."""
         return None if self.process is None else self.process.exitcode
 
-    def kill(self) -> None:
+    def end(self) -> None:
+        """Kills the process if it still runs, and forgets it."""
         if self.process is not None:
-            self.process.kill()
+            if self.process.exitcode is None:
+                self.process.kill()
             self.process.join(1.0)
+        if self.pipe is not None:
+            self.pipe.close()
+        self.process = self.pipe = None
+
+    @property
+    def pid(self) -> int | None:
+        return None if self.process is None else self.process.pid
 
     def send(self, number: signal.Signals) -> None:
         """Sends a signal to the process, if there is one."""
-        if self.process is not None and self.process.pid is not None:
+        if self.pid is not None:
             with contextlib.suppress(ProcessLookupError):
-                os.kill(self.process.pid, number)
-
-    def state(self) -> str:
-        """State of the process, according to the kernel."""
-        import psutil
-
-        with contextlib.suppress(psutil.Error):
-            process = psutil.Process(self.process.pid if self.process is not None else None)
-            return f"{process.status()}, {process.num_threads()} threads"
-        return "gone"
+                os.kill(self.pid, number)
 
     def hear_last_word(self) -> ExitReason | None:
         with contextlib.suppress(EOFError, OSError):
@@ -177,6 +168,10 @@ class LocalSwarm:
         self._context = multiprocessing.get_context("forkserver")
 
     @property
+    def alive(self) -> list[Running]:
+        return [running for running in self.running if running.alive]
+
+    @property
     def restarts(self) -> int:
         return sum(running.restarts for running in self.running)
 
@@ -205,16 +200,6 @@ class LocalSwarm:
                 if running.process is not None:
                     running.process.terminate()
 
-    def _let_go(self) -> None:
-        """Forgets dismissed processes that have ended, and kills those that do not end."""
-        for running in [each for each in self.running if each.dismissed_s is not None]:
-            if running.alive and running.exitcode is None:
-                if time.monotonic() - (running.dismissed_s or 0.0) > STOP_GRACE_S:
-                    running.kill()
-                continue
-            self._forget(running)
-            self.running.remove(running)
-
     def poll(self) -> list[Ending]:
         """Reaps processes which ended, kills those which hang, and starts those which are due."""
         self._let_go()
@@ -224,22 +209,28 @@ class LocalSwarm:
         ended = wait([running.process.sentinel for running in self.running if running.process is not None], 0)
         for running in self.running:
             process = running.process
+            if running.begins_when is not None and running.begins_when():
+                running.begins_when, running.due_s = None, 0.0
             if running.dismissed_s is not None:
                 continue
             if process is not None and process.sentinel in ended and process.exitcode is not None:
                 endings.append(self._ended(running, process.exitcode))
-            elif running.begins_when is not None and running.begins_when():
-                running.begins_when = None
-                self._start(running)
             elif running.due_s is not None and time.monotonic() >= running.due_s:
                 try:
-                    self._start(running, running.restarts + 1)
-                    running.restarts += 1
+                    self._start(running)
                 except SwarmError as error:  # its folder cannot be written
-                    wait_s = running.backoff.crashed(0.0)
+                    wait_s = running.crashed(0.0)
                     running.due_s = time.monotonic() + wait_s
                     endings.append(Ending(running.spec, str(error), error.exit_code, wait_s, running.restarts + 1))
         return endings
+
+    def _let_go(self) -> None:
+        """Forgets dismissed processes that have ended, and kills those that do not end."""
+        for running in [each for each in self.running if each.dismissed_s is not None]:
+            patience_s = (running.dismissed_s or 0.0) + STOP_GRACE_S - time.monotonic()
+            if not running.alive or running.exitcode is not None or patience_s < 0.0:
+                running.end()
+                self.running.remove(running)
 
     def _end_hung(self) -> None:
         """Ends processes which hang (`hang_watch`). First SIGABRT: the process logs the stacks of all its threads.
@@ -256,7 +247,7 @@ class LocalSwarm:
             if not running.stillness.needs_look(stamp_ns):
                 continue
             idle = self._idle.any_until(now_s) if idle is None else idle
-            sight = None if running.process is None else sight_of(running.process.pid or 0)
+            sight = sight_of(running.pid)
             if sight is None or not running.stillness.hangs(sight, passed_s, idle):
                 continue
             if running.hung_s is None:
@@ -267,9 +258,7 @@ class LocalSwarm:
                 running.send(signal.SIGKILL)
 
     def stop(
-        self,
-        while_waiting: Callable[[], None] = lambda: None,
-        force: Callable[[], bool] = lambda: False,
+        self, while_waiting: Callable[[], None] = lambda: None, force: Callable[[], bool] = lambda: False
     ) -> list[str]:
         """Ends all processes, role by role: by SIGKILL those which still run after `STOP_GRACE_S`. Returns a
         sentence for each process that did not end as asked.
@@ -280,38 +269,50 @@ class LocalSwarm:
         Once `force` returns True, all are asked at once and get `FORCED_GRACE_S`. A process killed then is in
         `cut_short`, and is no failure.
         """
+
+        def wait_until(done: Callable[[], bool], within_s: float, force: Callable[[], bool] = force) -> None:
+            deadline_s = time.monotonic() + within_s
+            while not done() and time.monotonic() < deadline_s and not force():
+                while_waiting()
+
+        def ask(processes: list[Running], within_s: float, force: Callable[[], bool] = force) -> None:
+            for running in processes:
+                if running.process is not None:
+                    running.process.terminate()
+            wait_until(
+                lambda: all(each.ended_as_asked or each.exitcode is not None for each in processes), within_s, force
+            )
+
         for running in self.running:
             running.due_s = running.begins_when = None
         failures = []
         for role in STOP_ORDER:
-            of_role = [running for running in self.running if running.spec.role == role and running.alive]
+            of_role = [running for running in self.alive if running.spec.role == role]
             if of_role and not force():
-                _ask(of_role, STOP_GRACE_S, while_waiting, force)
+                ask(of_role, STOP_GRACE_S)
                 failures += [said for running in of_role if (said := self._failure(running, force())) is not None]
-        leaving = [running for running in self.running if running.alive and running.ended_as_asked]
-        _wait(lambda: all(each.exitcode is not None for each in leaving), STOP_GRACE_S, while_waiting, force)
+        leaving = [running for running in self.alive if running.ended_as_asked]
+        wait_until(lambda: all(each.exitcode is not None for each in leaving), STOP_GRACE_S)
         for running in leaving:
             if running.exitcode is None:
-                log.warning("%s has ended and does not leave: %s", running.spec.name, running.state())
-                running.kill()
-            self._forget(running)
-        left = [running for running in self.running if running.alive]
-        _ask(left, FORCED_GRACE_S, while_waiting, lambda: False)
+                log.warning("%s has ended and does not leave: %s", running.spec.name, sight_of(running.pid))
+            running.end()
+        left = self.alive
+        ask(left, FORCED_GRACE_S, lambda: False)
         for running in left:
             if running.exitcode is None:
-                running.kill()
                 self.cut_short.append(running.spec.name)
-            self._forget(running)
+            running.end()
         return failures
 
     def kill(self) -> None:
         """Kills all processes."""
         for running in self.running:
             running.due_s = running.begins_when = None
-            running.kill()
-            self._forget(running)
+            running.end()
 
-    def _start(self, running: Running, restarts: int = 0) -> None:
+    def _start(self, running: Running) -> None:
+        restarts = running.restarts + bool(running.began_s)
         listen, tell = self._context.Pipe(duplex=False)
         spec = running.spec
         setup = self._setup_of(spec)
@@ -331,28 +332,27 @@ class LocalSwarm:
         tell.close()
         running.process, running.pipe, running.last_word = process, listen, None
         running.began_s, running.due_s, running.hung_s = time.monotonic(), None, None
+        running.restarts = restarts
 
     def _ended(self, running: Running, code: int) -> Ending:
         """Decides what follows an unexpected end."""
         reason = self._exit_reason(running, code)
-        self._forget(running)
+        running.end()
         now_s = time.monotonic()
         ran_s = now_s - running.began_s
-        wait_s: float | None = running.backoff.crashed(ran_s)
-        if reason.refused and self._is_final(running, reason.exit_code, ran_s, now_s):
-            expendable = running.spec.added or TABLE[running.spec.role].expendable
-            wait_s = FINALLY_REFUSED_WAIT_S if expendable else None
+        wait_s: float | None = running.crashed(ran_s)
+        if reason.refused:
+            running.refused_s = [each for each in running.refused_s if now_s - each < REFUSALS_WITHIN_S] + [now_s]
+            # At the first start a refusal is final; later only after several in a short time, as the network may be
+            # the cause. A disk that was written to once is full and will have space again.
+            first = running.restarts == 0 and ran_s < SETTLED_S
+            often = len(running.refused_s) >= REFUSALS_ALLOWED and reason.exit_code != StoreError.exit_code
+            if first or often:
+                expendable = running.spec.added or TABLE[running.spec.role].expendable
+                wait_s = FINALLY_REFUSED_WAIT_S if expendable else None
         if wait_s is not None:
             running.due_s = now_s + wait_s
         return Ending(running.spec, reason.sentence, reason.exit_code, wait_s, running.restarts + 1)
-
-    def _is_final(self, running: Running, exit_code: int, ran_s: float, now_s: float) -> bool:
-        """Returns True if a process that refused to run now would do so again. At the first start a refusal is
-        final; later, only after several in a short time, as the network may be the cause. A disk that was written
-        to once is full and will have space again."""
-        running.refused_s = [each for each in running.refused_s if now_s - each < REFUSALS_WITHIN_S] + [now_s]
-        first = running.restarts == 0 and ran_s < SETTLED_S
-        return first or (exit_code != StoreError.exit_code and len(running.refused_s) >= REFUSALS_ALLOWED)
 
     def _exit_reason(self, running: Running, code: int) -> ExitReason:
         if code == 255:
@@ -376,36 +376,8 @@ class LocalSwarm:
         if running.ended_as_asked or (code is None and force):
             return None
         if code is None:
-            running.kill()
             said = f"{running.spec.name} did not end within {STOP_GRACE_S:g} s and was killed"
         elif code not in (0, -signal.SIGTERM):  # SIGTERM itself, if it came before the handler
             said = f"{running.spec.name} was asked to end, but {self._exit_reason(running, code).sentence}"
-        self._forget(running)
+        running.end()
         return said
-
-    def _forget(self, running: Running) -> None:
-        if running.pipe is not None:
-            running.pipe.close()
-        if running.process is not None:
-            running.process.join(1.0)
-        running.process = running.pipe = None
-
-
-def _ask(
-    processes: Sequence[Running], within_s: float, while_waiting: Callable[[], None], force: Callable[[], bool]
-) -> None:
-    """Asks processes to end, and waits until all have, the time is over, or `force` says so."""
-    for running in processes:
-        if running.process is not None:
-            running.process.terminate()
-    ended = lambda: all(each.ended_as_asked or each.exitcode is not None for each in processes)  # noqa: E731
-    _wait(ended, within_s, while_waiting, force)
-
-
-def _wait(
-    done: Callable[[], bool], within_s: float, while_waiting: Callable[[], None], force: Callable[[], bool]
-) -> None:
-    """Waits until it is done, the time is over, or `force` says so."""
-    deadline_s = time.monotonic() + within_s
-    while not done() and time.monotonic() < deadline_s and not force():
-        while_waiting()

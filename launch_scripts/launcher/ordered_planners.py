@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection
+from dataclasses import dataclass, field
 
 import msgspec
 
@@ -21,86 +22,79 @@ _BEGINS_WITHIN_S = 10.0
 """A planner that has not come up by then holds up no other."""
 
 
+@dataclass(slots=True)
 class OrderedPlanners:
     """Starts and ends planners on this machine according to orders.
 
-    ranks  which of an added target's planners to start here
-    own    processes that this launcher started: for the scenario's targets, it manages only these planners
-    whole  whether this launcher started the whole swarm: then no other will start them
-    say    tells the user
-    no_room  number of planners of added targets here -> reason why the machine cannot carry that number; None if it
-             can
+    ranks      which of an added target's planners to start here
+    own        processes that this launcher started: for the scenario's targets, it manages only these planners
+    is_whole   whether this launcher started the whole swarm: then no other will start them
+    say        tells the user
+    no_room    number of planners of added targets here -> reason why the machine cannot carry that number; None if
+               it can
+    missing_s  planner -> since when it has been missing
+    started_s  planner -> when it was started here last
+    refused    planners that could not be started
+    told       reason why planners are not started, as the user was told last
     """
 
-    def __init__(
-        self,
-        scenario: Scenario,
-        swarm: LocalSwarm,
-        ranks: Collection[int],
-        own: Collection[ProcessSpec],
-        whole: bool,
-        say: Callable[[str], None],
-        no_room: Callable[[int], str | None] = lambda planners: None,
-    ) -> None:
-        self._scenario = scenario
-        self._swarm = swarm
-        self._ranks = ranks
-        self._own = [spec.id for spec in own if spec.role == "planner"]
-        self._wait_s = 0.0 if whole else LEAVES_TO_OTHERS_S
-        self._say = say
-        self._missing_s: dict[str, float] = {}
-        """Planner -> since when it has been missing."""
-        self._no_room = no_room
-        self._started_s: dict[str, float] = {}
-        """Planner -> when it was started here last."""
-        self._told = ""
-        """Reason why planners are not started, as the user was told last."""
-        self._refused: set[str] = set()
+    scenario: Scenario
+    swarm: LocalSwarm
+    ranks: Collection[int]
+    own: Collection[ProcessSpec]
+    is_whole: bool
+    say: Callable[[str], None]
+    no_room: Callable[[int], str | None]
+    missing_s: dict[str, float] = field(default_factory=dict)
+    started_s: dict[str, float] = field(default_factory=dict)
+    refused: set[str] = field(default_factory=set)
+    told: str = ""
 
     def follow_orders(self, book: OrderBook, alive: Collection[tuple[str, str]], now_s: float) -> None:
         """Starts missing planners, and ends unwanted ones.
 
         alive  (role, id) of the processes that are up, anywhere
         """
-        targets = book.targets(self._scenario)
-        usual = set(self._scenario.target_ids)
-        wanted = {ranked_id(id, rank) for id in targets if id not in usual for rank in self._ranks}
-        here = {running.spec.id for running in self._swarm.running if running.spec.role == "planner"}
-        for id in sorted(here):
+        targets = book.targets(self.scenario)
+        usual = set(self.scenario.target_ids)
+        wanted = {ranked_id(id, rank) for id in targets if id not in usual for rank in self.ranks}
+        here = {running.spec.id for running in self.swarm.running if running.spec.role == "planner"}
+        for id in here:
             if job_of(id) not in targets:
-                self._swarm.dismiss(ProcessSpec("planner", id, added=True))
+                self.swarm.dismiss(ProcessSpec("planner", id, added=True))
         due = []
-        for id in sorted(wanted - here - self._refused):
+        for id in sorted(wanted - here - self.refused):
             if ("planner", id) in alive:
-                self._missing_s.pop(id, None)
-            elif now_s - self._missing_s.setdefault(id, now_s) >= self._wait_s:
+                self.missing_s.pop(id, None)
+            elif now_s - self.missing_s.setdefault(id, now_s) >= (0.0 if self.is_whole else LEAVES_TO_OTHERS_S):
                 due.append(id)
-        begin = [id for id, since_s in self._started_s.items() if now_s - since_s < _BEGINS_WITHIN_S]
+        begin = [id for id, since_s in self.started_s.items() if now_s - since_s < _BEGINS_WITHIN_S]
         free = _BEGIN_AT_ONCE - sum(("planner", id) not in alive for id in begin)
         for id in due[: max(free, 0)]:
-            if (reason := self._no_room(len(wanted & here) + 1)) is not None:
-                if reason != self._told:
+            if (reason := self.no_room(len(wanted & here) + 1)) is not None:
+                if reason != self.told:
                     more = f" and {len(due) - 1} more" if len(due) > 1 else ""
-                    self._say(f"planner-{id}{more}: not started: {reason}")
-                self._told = reason
+                    self.say(f"planner-{id}{more}: not started: {reason}")
+                self.told = reason
                 break
             here.add(id)
-            self._started_s[id] = now_s
+            self.started_s[id] = now_s
             self._start(id)
         # One that the scenario has, and that was removed, is wanted again when its removal is taken back.
-        for id in sorted({id for id in self._own if job_of(id) in targets} - here):
-            if any(order.subject == "target" and order.name == job_of(id) for order in book):
-                self._start(id)
+        ordered = {order.name for order in book if order.subject == "target"} & set(targets)
+        for spec in self.own:
+            if spec.role == "planner" and job_of(spec.id) in ordered and spec.id not in here:
+                self._start(spec.id)
 
     def _start(self, id: str) -> None:
         try:
-            self._swarm.add(ProcessSpec("planner", id, added=True))
+            self.swarm.add(ProcessSpec("planner", id, added=True))
         except SwarmError as error:
-            self._refused.add(id)
-            self._say(f"planner-{id}: {error}")
+            self.refused.add(id)
+            self.say(f"planner-{id}: {error}")
             return
-        self._missing_s.pop(id, None)
-        self._say(f"planner-{id} starts: its target was added")
+        self.missing_s.pop(id, None)
+        self.say(f"planner-{id} starts: its target was added")
 
 
 def with_target(scenario: Scenario, book: OrderBook, id: str) -> Scenario:

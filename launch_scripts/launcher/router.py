@@ -81,29 +81,28 @@ class RouterService(MemberService):
 
 
 class Admission:
-    """The router's session, reopened whenever the list of revoked names changes."""
+    """The router's session, behind a door at its `tls/` endpoints, and reopened whenever the list of revoked names
+    changes. Raises BusError if it cannot listen."""
 
     def __init__(self, network: NetworkConfig) -> None:
         self._authenticator = authenticator_of(network, "")  # a router belongs to no run
-        self._door, network = behind_door(network)
-        self._network = network
-        self._admitting = with_revocations(network)
+        self._network, self._door = network, None
+        if outside := [endpoint for endpoint in network.listen if endpoint.startswith("tls/")]:
+            inner = LOOPBACK, free_ports(1)[0]
+            self._door = Door([host_port(each) for each in outside], inner)
+            within = f"tls/{inner[0]}:{inner[1]}#tls_handshake_timeout_ms={HANDSHAKE_S * 1000:.0f}"
+            others = tuple(each for each in network.listen if each not in outside)
+            self._network = msgspec.structs.replace(network, listen=(*others, within))
+        self._admitting = with_revocations(self._network)
         self._failure = ""
         """Reason why the file of revoked names could not be read at the last look."""
-        try:
-            self.bus = open_bus(self._admitting, mode="router", authenticator=self._authenticator)
-        except BaseException:
-            self._close_door()
-            raise
+        self.bus = self._opened(within_s=0.0)
 
     def close(self) -> None:
         """Leaves the network."""
-        self._close_door()
-        self.bus.close()
-
-    def _close_door(self) -> None:
         if self._door is not None:
             self._door.close()
+        self.bus.close()
 
     def reopened(self) -> ZenohBus | None:
         """The new session, if one was opened. If the list cannot be read, the previous one stays in force."""
@@ -120,11 +119,11 @@ class Admission:
         log.warning("revoked names: %s; reopening the session", ", ".join(admitting.revoked) or "none")
         self._admitting = admitting
         self.bus.close()
-        self.bus = self._open()
+        self.bus = self._opened(_OPEN_WITHIN_S)
         return self.bus
 
-    def _open(self) -> ZenohBus:
-        until_s = time.monotonic() + _OPEN_WITHIN_S
+    def _opened(self, within_s: float) -> ZenohBus:
+        until_s = time.monotonic() + within_s
         while True:
             try:
                 return open_bus(self._admitting, mode="router", authenticator=self._authenticator)
@@ -132,19 +131,6 @@ class Admission:
                 if time.monotonic() > until_s:
                     raise
                 time.sleep(0.05)
-
-
-def behind_door(network: NetworkConfig) -> tuple[Door | None, NetworkConfig]:
-    """A door at the `tls/` endpoints of a router, if it has any, and the network as the router listens then. Raises
-    BusError if it cannot listen."""
-    outside = [endpoint for endpoint in network.listen if endpoint.startswith("tls/")]
-    if not outside:
-        return None, network
-    inner = LOOPBACK, free_ports(1)[0]
-    door = Door([host_port(each) for each in outside], inner)
-    within = f"tls/{inner[0]}:{inner[1]}#tls_handshake_timeout_ms={HANDSHAKE_S * 1000:.0f}"
-    others = tuple(each for each in network.listen if each not in outside)
-    return door, msgspec.structs.replace(network, listen=(*others, within))
 
 
 def run(setup: RoleSetup, built: Callable[[], None]) -> None:

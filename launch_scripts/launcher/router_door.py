@@ -62,6 +62,16 @@ class _Tries:
     failed: float = 0.0
     since_s: float = 0.0
 
+    def at(self, now_s: float) -> _Tries:
+        """Forgets failures for the time that has passed, and returns itself."""
+        self.failed = max(self.failed - (now_s - self.since_s) * _FORGIVEN_PER_S, 0.0)
+        self.since_s = now_s
+        return self
+
+    @property
+    def any(self) -> bool:
+        return bool(self.unproved or self.proved or self.failed)
+
 
 class Knocks:
     """Judge of which connections are passed on, by address. Pure: times are in seconds of any clock."""
@@ -72,11 +82,10 @@ class Knocks:
     def admits(self, address: str, now_s: float) -> bool:
         """Returns True if a connection is passed on; it counts as unproved then."""
         if address not in self._tries and len(self._tries) >= _MOST_ADDRESSES:
-            self._tries = {each: tries for each, tries in self._tries.items() if not self._is_idle(tries, now_s)}
+            self._tries = {each: tries for each, tries in self._tries.items() if tries.at(now_s).any}
             if len(self._tries) >= _MOST_ADDRESSES:
                 return False
-        tries = self._tries.setdefault(address, _Tries(since_s=now_s))
-        self._forgive(tries, now_s)
+        tries = self._tries.setdefault(address, _Tries(since_s=now_s)).at(now_s)
         if tries.unproved + tries.failed + 1 > FREE_TRIES + tries.proved:
             return False
         tries.unproved += 1
@@ -89,22 +98,12 @@ class Knocks:
 
     def ended(self, address: str, proved: bool, now_s: float) -> None:
         """Takes note of the end of a connection that was passed on."""
-        tries = self._tries[address]
-        self._forgive(tries, now_s)
+        tries = self._tries[address].at(now_s)
         if proved:
             tries.proved -= 1
         else:
             tries.unproved -= 1
             tries.failed += 1
-
-    def _is_idle(self, tries: _Tries, now_s: float) -> bool:
-        self._forgive(tries, now_s)
-        return not (tries.unproved or tries.proved or tries.failed)
-
-    @staticmethod
-    def _forgive(tries: _Tries, now_s: float) -> None:
-        tries.failed = max(tries.failed - (now_s - tries.since_s) * _FORGIVEN_PER_S, 0.0)
-        tries.since_s = now_s
 
 
 def neighbourhood(host: str) -> str:

@@ -66,20 +66,16 @@ class StopAsked:
         """Exit code of a run that a signal ended, as shells have it: 128 and the signal's number."""
         return 128 + (self.number or 0)
 
-    def interruptible(self, work: Callable[[], T]) -> T | None:
+    def interruptible(self, work: Callable[[], T], *, anew: bool = False) -> T | None:
         """The result of `work`, or None if a signal has left it, or came before: for what takes long while there is
-        no process to be ended."""
-        return self._until(work, self.__bool__)
+        no process to be ended.
 
-    def interruptible_once_more(self, work: Callable[[], T]) -> T | None:
-        """Same, but without earlier signals: only a further SIGINT or SIGTERM interrupts this work."""
+        anew  earlier signals do not count: only a further SIGINT or SIGTERM interrupts the work
+        """
         most = max(self._times, 1)
-        return self._until(work, lambda: self._times > most)
-
-    def _until(self, work: Callable[[], T], leaves: Callable[[], bool]) -> T | None:
         try:
-            self._leaves = leaves
-            return None if leaves() else work()
+            self._leaves = (lambda: self._times > most) if anew else self.__bool__
+            return None if self._leaves() else work()
         except KeyboardInterrupt:
             return None
         finally:
@@ -94,26 +90,27 @@ class MachineSignals:
     """
 
     def __init__(self, options: UpOptions, run_id: str, seen: Callable[[], Sequence[Process]]) -> None:
-        self._run = (run_id, options.scenario.name)
+        self._options, self._run_id, self._seen = options, run_id, seen
         self._health = Health(supervisor=supervisor_of(os.environ))
         self._health.starts("the start of its processes")
         self._health.begins(_TURNS_HZ)
-        self.url = ""
-        """URL of the metrics; empty without a port, and before it is opened."""
-        self._port, self._address = options.metrics_port, options.signals_address
-        self._seen = seen
         self._metrics: MetricsEndpoint | None = None
         if not options.takes_over:
             self._open()
 
+    @property
+    def url(self) -> str:
+        """URL of the metrics; empty without a port, and before it is opened."""
+        return "" if self._metrics is None else self._metrics.url
+
     def _open(self) -> None:
-        if self._port is None:
+        port, address = self._options.metrics_port, self._options.signals_address
+        if port is None or self._metrics is not None:
             return
         from launch_scripts.web.prometheus import MetricsEndpoint  # takes time to import
 
         board, seen = self._health.board, self._seen
-        self._metrics = MetricsEndpoint(self._port, lambda: [Process(_NAME, board.read()), *seen()], self._address)
-        self.url = self._metrics.url
+        self._metrics = MetricsEndpoint(port, lambda: [Process(_NAME, board.read()), *seen()], address)
 
     def turned(
         self,
@@ -129,13 +126,12 @@ class MachineSignals:
                  observed, so the metrics name it
         """
         self._health.turned([f"word of {name}" for name in missing])
-        if self._metrics is None:
-            with suppress(BusError):  # the launcher before still has the port
-                self._open()
+        with suppress(BusError):  # the launcher before still has the port
+            self._open()
         if self._metrics is not None:
             from launch_scripts.web.prometheus import Run, families
 
-            run = Run(*self._run, started_ns) if up is None else None
+            run = Run(self._run_id, self._options.scenario.name, started_ns) if up is None else None
             alive = observed.up() if up is None else up
             status = observed.status if up is None else {}  # a part hears it until a route is served
             self._metrics.answer(lambda: families(run, observed, status, alive))

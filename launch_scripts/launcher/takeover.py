@@ -45,10 +45,12 @@ class TakeOver:
         self._run_dir = run_dir
         self.predecessors = processes(run_dir)
         """Name -> pid of the processes that are followed."""
-        left = set(self.predecessors) - {each.spec.name for each in running}
-        if left := {name for name in left if not _was_ordered(name, targets)}:
+        own = {each.spec.name for each in running}
+        planners = {name for name in self.predecessors if name.startswith("planner-")}
+        added = {name for name in planners if job_of(name.removeprefix("planner-")) not in targets}
+        if left := sorted(self.predecessors.keys() - own - added):
             raise ConfigError(
-                f"--take-over: the launcher in {run_dir} runs {', '.join(sorted(left))} too, which this one would "
+                f"--take-over: the launcher in {run_dir} runs {', '.join(left)} too, which this one would "
                 "end and not start again: give it the same part"
             )
         self._began_s: float | None = None
@@ -74,31 +76,23 @@ class TakeOver:
         """Performs all steps that have become possible. `now_s`: of a clock that only goes on."""
         if self._asked:
             return
-        if has_ended(self._launcher):
-            self._asked = True
-            self._say("the launcher before has ended by itself")
-            self._look_again()
-            return
-        if self._began_s is None:
-            self._began_s = now_s
+        self._began_s = now_s if self._began_s is None else self._began_s
         impatient = now_s - self._began_s >= _PATIENCE_S
-        if not self._planners_ready:
+        if has_ended(self._launcher):
+            self._say("the launcher before has ended by itself")
+        elif not self._planners_ready:
             self._planners_ready = impatient or all(map(_plans, self._running))
+            return
         elif impatient or all(map(_waits, self._running)):
-            self._ask_to_end()
-
-    def _ask_to_end(self) -> None:
+            self._say("successors are ready: the launcher before is asked to end")
+            log.info("asks the launcher before to end, pid %d", self._launcher)
+            with contextlib.suppress(ProcessLookupError):  # it has ended meanwhile
+                os.kill(self._launcher, signal.SIGTERM)
+        else:
+            return
         self._asked = True
-        self._say("successors are ready: the launcher before is asked to end")
-        log.info("asks the launcher before to end, pid %d", self._launcher)
-        with contextlib.suppress(ProcessLookupError):  # it has ended meanwhile
-            os.kill(self._launcher, signal.SIGTERM)
-        self._look_again()
-
-    def _look_again(self) -> None:
-        """Updates the process to follow: one that has crashed meanwhile runs in a new generation, or is gone."""
-        own = [each.process.pid for each in self._running if each.process is not None]
-        self.predecessors = processes(self._run_dir, [pid for pid in own if pid is not None])
+        # Once more: a process to follow that has crashed meanwhile runs in a new generation, or is gone.
+        self.predecessors = processes(self._run_dir, [each.pid for each in self._running])
 
     def _is_free(self, name: str) -> bool:
         """Returns True if the exclusive resources of a process are free. The old launcher restarts crashed
@@ -123,12 +117,6 @@ def _waits(running: Running) -> bool:
     return not running.takes_over or _lacks(running) in ((GENERATION_BEFORE,), ())
 
 
-def _was_ordered(name: str, targets: Collection[str]) -> bool:
-    """Returns True if a process is the planner of a target that an operator has added."""
-    role, _, id = name.partition("-")
-    return role == "planner" and job_of(id) not in targets
-
-
 def _launcher_of(run_dir: Path) -> int:
     """The pid of the launcher that runs a run's part from this folder. Raises ConfigError where there is none, or
     one is being taken over from already."""
@@ -143,7 +131,7 @@ def _launcher_of(run_dir: Path) -> int:
     return found[0]
 
 
-def processes(run_dir: Path, other_than: Collection[int] = ()) -> dict[str, int]:
+def processes(run_dir: Path, other_than: Collection[int | None] = ()) -> dict[str, int]:
     """Name -> pid of the processes that log into a run's folder; the launcher itself is not among them."""
     found = logging_into(run_dir)
     return {name: pid for name, pid in found.items() if name.startswith(_NAMES) and pid not in other_than}

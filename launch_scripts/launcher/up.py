@@ -49,7 +49,6 @@ from swarm.errors import BusError, StoreError, SwarmError
 from swarm.peers import Peer, job_of
 from swarm.plugins.find import check_plugins
 from swarm.runtime.membership import check_belongs
-from swarm.runtime.order_book import OrderBook
 from swarm.runtime.role_setup import RoleSetup
 from swarm.runtime.run_secret import authenticator_of
 from swarm.wire.messages.processes import RunInfo
@@ -93,9 +92,8 @@ def _run_id_of(options: run_options.UpOptions) -> tuple[str, int | None]:
     found: list[RunInfo] = []
     if options.joins or options.takes_over:
         log_to(None, options.log_format)  # it may have to wait, and says so
-        found = [
-            info for info in find_members(run_options.as_process(options.scenario, LAUNCHER, "0")) if info.run_id
-        ]
+        members = find_members(run_options.as_process(options.scenario, LAUNCHER, "0"))
+        found = [info for info in members if info.run_id]
     run_id = options.run_id
     if run_id is None and options.is_whole and not options.takes_over:
         run_id = run_options.new_run_id()
@@ -112,22 +110,16 @@ class _Run:
         self._scenario = run_options.as_process(options.scenario, LAUNCHER, "0")
         self._run_dir = run_dir
         self._run_id = run_id
-        self._joined_ns = started_ns
-        """Time when the run began that this is a part of; None if it begins here."""
-        self._started_ns = started_ns or time.time_ns()
-        self._book = OrderBook()
-        """Orders in force, once the swarm is watched."""
+        self._started_ns = started_ns or 0
+        """Time when the run began; 0 before a run that begins here."""
         lines = JsonLines(Speaker(LAUNCHER, "0", run_id)) if options.log_format == "json" else None
         self._terminal = Terminal(options.as_json, options.plain, lines)
         self._stop_asked = StopAsked()
-        self._preparing = "preparing the terrain"
         self._swarm = LocalSwarm(options.table, self._setup_of, run_dir, options.log_format)
         self._disk = DiskWatch(run_dir)
         self.begun = False
         """True if everything that can be refused before a process starts has been accepted."""
         self._startup_s: float | None = None
-        self._up_at_s: float | None = None
-        """time.monotonic() when the swarm was whole."""
         self._web_port = 0
         self._outlasts = False
         """True while the run goes on for a viewer only."""
@@ -137,13 +129,12 @@ class _Run:
             targets = options.scenario.target_ids
             self._take_over = TakeOver(run_dir, self._swarm.running, targets, self._terminal.say)
         self._signals = MachineSignals(options, run_id, self._swarm.seen)
-        self._doing: Callable[[], str] = lambda: self._preparing
+        self._doing: Callable[[], str] = lambda: "preparing the terrain"
         self._page: LivePage | None = None
         """The live view's start page, until the monitor serves it."""
         view = options.scenario.monitor
         if "monitor" in options.roles and view.live and view.web_port and not options.takes_over:
-            name = f"{self._scenario.name}, run {run_id}"
-            told = {"life": "", "at_s": 0.0, "name": name}
+            told = {"life": "", "at_s": 0.0, "name": f"{self._scenario.name}, run {run_id}"}
             self._page = when_free(lambda: LivePage(view.web_port, lambda: {**told, "state": self._doing()}))
             self._say_page(view.web_port)
         if self._signals.url:
@@ -154,7 +145,6 @@ class _Run:
         self._register()
         planners = any(TABLE[role].kernels for role in self._options.roles)
         self._warm_up = WarmUp(ROLES_AND_KERNELS if planners else ROLES_ONLY, self._scenario if planners else None)
-        self._warm_up.begin()
         try:
             return self._run()
         finally:
@@ -163,7 +153,7 @@ class _Run:
             self._leave_page()
 
     def _run(self) -> int:
-        with self._terminal.busy(lambda: self._preparing):
+        with self._terminal.busy(lambda: self._doing()):
             prepared = self._stop_asked.interruptible(self._prepared)
         if prepared is None:
             return self._stopped_early()
@@ -179,18 +169,16 @@ class _Run:
         if self._options.run_id is None and not self._options.takes_over and (self._run_dir / REPORT_FILE).exists():
             self._terminal.say(f"run {self._run_id} continues: there is a report of it already", "yellow")
         log.info("terrain is ready")
-        self._wait(lambda: self._warm_up.progress, self._warm_up.done)
-        if self._stop_asked:
+        if not self._waited(lambda: self._warm_up.progress, self._warm_up.done):
             return self._stopped_early()
         log.info("kernels are loaded")
         failures: list[str] = []
-        self._started_ns = self._joined_ns or time.time_ns()
+        self._started_ns = self._started_ns or time.time_ns()
         try:
             if not self._options.joins and "router" in self._options.roles:
                 self._swarm.start("router")
             within_s = math.inf if self._options.joins else _LISTEN_WITHIN_S
-            self._wait(lambda: "waiting for the router to listen", self._router_listens, within_s)
-            if self._stop_asked:
+            if not self._waited(lambda: "waiting for the router to listen", self._router_listens, within_s):
                 self._swarm.stop(lambda: time.sleep(_TURN_S), force=self._stop_asked.force)
                 return self._stopped_early()
             log.info("the router listens")
@@ -198,12 +186,10 @@ class _Run:
             with open_bus(network, authenticator=authenticator_of(network, self._run_id)) as bus:
                 self._join(bus)
                 self._say_begin()
-                known: Recorder | OwnPart = OwnPart(self._terrain.grid, self._started_ns)
-                if self._options.records:
-                    known = Recorder(self._scenario, self._terrain.grid, self._started_ns)
+                grid, since_ns = self._terrain.grid, self._started_ns
+                known = Recorder(self._scenario, grid, since_ns) if records else OwnPart(grid, since_ns)
                 self._known = known
                 watcher = Watcher(bus, known, MonotonicClock())
-                watcher.begin()
                 watcher.look_after([running.spec for running in self._swarm.running])
                 try:
                     self._leave_page()
@@ -250,15 +236,19 @@ class _Run:
         return terrain, truth
 
     def _prepares(self, what: str, share: float) -> None:
-        self._preparing = f"preparing the terrain: {what}, {share:.0%}"
+        self._doing = lambda: f"preparing the terrain: {what}, {share:.0%}"
 
     def _setup_of(self, spec: ProcessSpec) -> RoleSetup:
         scenario = run_options.as_process(self._options.scenario, spec.role, spec.id)
-        if spec.role == "planner":
-            scenario = with_target(scenario, self._book, job_of(spec.id))
         incarnation = run_options.next_incarnation(self._run_dir, spec.role, spec.id)
-        if self._known is not None and self._take_over is None:  # else those before are its own, too
-            self._known.observed.started(Peer(spec.role, spec.id, incarnation))
+        before = None
+        if self._known is not None:
+            observed = self._known.observed
+            before = observed.newest_stats(spec.role, spec.id)
+            if spec.role == "planner":
+                scenario = with_target(scenario, observed.book, job_of(spec.id))
+            if self._take_over is None:  # else those before are its own, too
+                observed.started(Peer(spec.role, spec.id, incarnation))
         return RoleSetup(
             scenario=scenario,
             run_id=self._run_id,
@@ -269,16 +259,17 @@ class _Run:
             run_dir=self._run_dir,
             record_inputs=self._options.record_inputs,
             anew=self._options.is_new,
-            before=None if self._known is None else self._known.observed.newest_stats(spec.role, spec.id),
+            before=before,
         )
 
-    def _wait(self, text: Callable[[], str], done: Callable[[float], bool], within_s: float = 600.0) -> None:
-        """Waits for `done(timeout_s)` or a signal, and shows so if it takes long."""
+    def _waited(self, text: Callable[[], str], done: Callable[[float], bool], within_s: float = 600.0) -> bool:
+        """Waits for `done(timeout_s)`, and shows so if it takes long. Returns False if a signal ended that."""
         began_s, self._doing = time.monotonic(), text
         with self._terminal.busy(text):
             while not self._stop_asked and not done(_TURN_S):
                 if time.monotonic() - began_s > within_s:
                     raise BusError(f"gave up {text()} after {within_s:g} s; see {self._run_dir}")
+        return not self._stop_asked
 
     def _router_listens(self, timeout_s: float) -> bool:
         self._raise_refusals(self._swarm.poll())
@@ -302,10 +293,17 @@ class _Run:
     def _watch(self, watcher: Watcher) -> float:
         """Watches the run until its time is over or a signal comes. Returns the seconds that it lasted."""
         began_s = watched_s = time.monotonic()
-        self._book = watcher.known.observed.book
-        ordered = self._ordered_planners()
+        options, observed = self._options, watcher.known.observed
+
+        def no_room(planners: int) -> str | None:
+            return why_no_room(self._scenario, self._terrain.grid.cells, planners, this_machine(self._run_dir))
+
+        whole, say = options.is_whole and not options.joins, self._terminal.say
+        ordered = OrderedPlanners(
+            self._scenario, self._swarm, options.ranks_of_added, options.table, whole, say, no_room
+        )
         while not self._stop_asked:
-            ordered.follow_orders(self._book, set(watcher.known.observed.up()), time.monotonic())
+            ordered.follow_orders(observed.book, set(observed.up()), time.monotonic())
             watcher.look_after([running.spec for running in self._swarm.running])
             if self._take_over is not None:
                 self._take_over.advance(time.monotonic())
@@ -315,7 +313,7 @@ class _Run:
             now_s = time.monotonic()
             if self._startup_s is None and self._is_up(watcher):
                 self._startup_s = now_s - self._options.began_s
-                self._up_at_s = began_s = now_s
+                began_s = now_s
                 served = watcher.routes_served or not self._all_external
                 so_far = "routes are served" if served else "targets wait for their trackers"
                 so_far += f", {self._startup_s:.1f} s after launch{self._limit('; the run lasts')}"
@@ -332,22 +330,10 @@ class _Run:
                 break
         return time.monotonic() - began_s
 
-    def _ordered_planners(self) -> OrderedPlanners:
-        options = self._options
-        whole = options.is_whole and not options.joins
-
-        def no_room(planners: int) -> str | None:
-            return why_no_room(self._scenario, self._terrain.grid.cells, planners, this_machine(self._run_dir))
-
-        return OrderedPlanners(
-            self._scenario, self._swarm, options.ranks_of_added, options.table, whole, self._terminal.say, no_room
-        )
-
     def _is_up(self, watcher: Watcher) -> bool:
         if self._missing(watcher) or (self._take_over is not None and not self._take_over.done):
             return False
-        planners = "planner" in self._options.roles
-        return not planners or watcher.routes_served or self._all_external
+        return "planner" not in self._options.roles or watcher.routes_served or self._all_external
 
     @property
     def _all_external(self) -> bool:
@@ -395,8 +381,8 @@ class _Run:
     def _title(self, up: str, missing: list[str]) -> str:
         """Returns the title line of the displays. Its time is that of the start-up, and then that of the run, as
         the numbers at the end have them."""
-        since_s = time.monotonic() - (self._up_at_s or self._options.began_s)
-        if self._up_at_s is None:
+        since_s = time.monotonic() - self._options.began_s - (self._startup_s or 0.0)
+        if self._startup_s is None:
             waits = f", waits for {', '.join(missing) or 'the whole swarm'}" * (len(missing) < 4)
             return f"{self._scenario.name}: starting, {up} processes are up{waits}, {since_s:.0f} s"
         of = "" if self._outlasts else self._limit(" of")
@@ -415,10 +401,9 @@ class _Run:
                 error.exit_code = ending.exit_code
                 raise error
             if ending.times <= 3 or ending.times % 10 == 0:
-                again = f"starts again in {ending.restart_in_s:g} s" + (
-                    f", time {ending.times}" * (ending.times > 1)
-                )
-                self._terminal.say(f"{ending.spec.name}: {ending.sentence}; {again}", "yellow")
+                again = f"starts again in {ending.restart_in_s:g} s"
+                times = f", time {ending.times}" if ending.times > 1 else ""
+                self._terminal.say(f"{ending.spec.name}: {ending.sentence}; {again}{times}", "yellow")
 
     def _stop(self, watcher: Watcher) -> list[str]:
         """Stops all roles in order, and records their last messages."""
@@ -426,23 +411,22 @@ class _Run:
         self._terminal.close()
         asked = "; once more, and what still runs is killed" if self._stop_asked else ""
         self._terminal.say(f"stopping{asked}")
-        watcher.end([running.spec for running in self._swarm.running])
-        with self._terminal.busy(self._stopping):
-            failures = self._swarm.stop(lambda: watcher.listen(_TURN_S), force=self._stop_asked.force)
+        swarm = self._swarm
+        watcher.end([running.spec for running in swarm.running])
+        with self._terminal.busy(
+            lambda: f"stopping: {len(swarm.alive)} of {len(swarm.running)} processes still run"
+        ):
+            failures = swarm.stop(lambda: watcher.listen(_TURN_S), force=self._stop_asked.force)
             watcher.finish()
-        if names := self._swarm.cut_short:
+        if names := swarm.cut_short:
             self._terminal.say(f"killed, as asked: {', '.join(names)}", "yellow")
         return failures
-
-    def _stopping(self) -> str:
-        alive = sum(running.alive for running in self._swarm.running)
-        return f"stopping: {alive} of {len(self._swarm.running)} processes still run"
 
     def _end(self, known: Recorder | OwnPart, seconds: float, failures: list[str]) -> int:
         """Writes what the run leaves, and says where it is. Returns 0 if it is whole and nothing was cut short."""
         try:
             with self._terminal.busy("writing the report and its picture"):
-                whole = self._stop_asked.interruptible_once_more(lambda: self._report(known, seconds, failures))
+                whole = self._stop_asked.interruptible(lambda: self._report(known, seconds, failures), anew=True)
         except StoreError as error:
             self._terminal.say(str(error), "red")
             return error.exit_code

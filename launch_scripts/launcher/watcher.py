@@ -63,8 +63,8 @@ class OwnPart(LatestState):
 
     def own_alarms(self, now_ns: int) -> list[str]:
         """Returns their alarms, in lines for people."""
-        alarms = alarms_of(self, self.plan.targets, now_ns)
-        return lines_of([alarm for alarm in alarms if alarm.lasts], self.grid, SHOWN_ALARMS)
+        lasting = [alarm for alarm in alarms_of(self, self.plan.targets, now_ns) if alarm.lasts]
+        return lines_of(lasting, self.grid, SHOWN_ALARMS)
 
     def line(self, title: str, now_ns: int, restarts: int) -> str:
         """All of it in one line."""
@@ -93,12 +93,9 @@ class Watcher(RunObserver):
         self._inbox = Inbox()
         # The first route tells that routes are served, sooner than any figures do.
         hears = _OF_PART if isinstance(known, OwnPart) else {**RECORDED, FOLLOWED: 0.0}
-        self._everywhere = list(hears)
         super().__init__(bus, self._inbox.post, known, {STATS: 0.0, NOTE: 0.0, **hears})
-
-    def begin(self) -> None:
-        self.keep_samples(self._everywhere)
-        if not isinstance(self.known, OwnPart):
+        self.keep_samples(list(hears))
+        if not isinstance(known, OwnPart):
             self.ask_gone()  # of a run that this is a part of
 
     def look_after(self, processes: Collection[ProcessSpec]) -> None:

@@ -74,7 +74,6 @@ def test_a_launcher_decodes_of_each_key_what_it_records_however_often_it_is_told
 ) -> None:
     swarm = SwarmModel()
     watcher = Watcher(swarm.bus("launcher"), Recorder(swarm.scenario, swarm.terrain.grid), swarm.scheduler.clock)
-    watcher.begin()
     speaker = swarm.bus("speaker")
     decoded.clear()
     for tenth, times in enumerate(bursts, start=1):

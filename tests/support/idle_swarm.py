@@ -29,5 +29,4 @@ def idle_swarm(folder: Path, *rows: tuple[str, str, str]) -> LocalSwarm:
 @cache
 def _warmed_up() -> None:
     warm_up = WarmUp(None)
-    warm_up.begin()
     eventually(lambda: warm_up.done(0.05), 20)

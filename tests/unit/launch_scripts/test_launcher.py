@@ -43,8 +43,18 @@ def swarm_of(swarms: list[LocalSwarm], folder: Path, *rows: tuple[str, str, str]
     return swarms[-1]
 
 
-def wait_for_line(path: Path, line: str, within_s: float = 10.0) -> None:
-    eventually(lambda: path.exists() and line in path.read_text().split(), within_s, f"{line} in {path.name}")
+def wait_for_start(folder: Path, name: str) -> None:
+    path = folder / "order.txt"
+    eventually(lambda: path.exists() and f"+{name}" in path.read_text().split(), 10.0, f"the start of {name}")
+
+
+def started(swarms: list[LocalSwarm], folder: Path, *rows: tuple[str, str, str]) -> LocalSwarm:
+    """Processes which have all begun."""
+    swarm = swarm_of(swarms, folder, *rows)
+    swarm.start()
+    for role, id, _ in rows:
+        wait_for_start(folder, f"{role}-{id}")
+    return swarm
 
 
 def endings_within(swarm: LocalSwarm, within_s: float = 10.0) -> list[Ending]:
@@ -60,11 +70,7 @@ def test_processes_end_role_by_role_and_each_has_a_log(swarms: list[LocalSwarm],
         ("planner", "t0", "quiet"),
         ("agent", "a0", "quiet"),
     ]
-    swarm = swarm_of(swarms, tmp_path, *rows)
-    swarm.start()
-    order = tmp_path / "order.txt"
-    for role, id, _ in rows:
-        wait_for_line(order, f"+{role}-{id}")
+    swarm, order = started(swarms, tmp_path, *rows), tmp_path / "order.txt"
     ours = os.getpriority(os.PRIO_PROCESS, 0)
     for running in swarm.running:
         assert running.process.pid is not None
@@ -113,10 +119,7 @@ def test_who_does_not_end_when_asked_is_killed_and_named(
     swarms: list[LocalSwarm], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("launch_scripts.launcher.local_processes.STOP_GRACE_S", 0.5)
-    swarm = swarm_of(swarms, tmp_path, ("agent", "a0", "stubborn"), ("router", "0", "quiet"))
-    swarm.start()
-    for line in ("+agent-a0", "+router-0"):
-        wait_for_line(tmp_path / "order.txt", line)
+    swarm = started(swarms, tmp_path, ("agent", "a0", "stubborn"), ("router", "0", "quiet"))
     assert "agent-a0 did not end within 0.5 s and was killed" in swarm.stop(lambda: time.sleep(0.02))
 
 
@@ -124,10 +127,7 @@ def test_who_has_ended_as_asked_and_does_not_leave_holds_up_nobody_and_is_no_fai
     swarms: list[LocalSwarm], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     rows = [("agent", "a0", "end_and_stay"), ("keeper", "0", "end_and_stay"), ("router", "0", "quiet")]
-    swarm = swarm_of(swarms, tmp_path, *rows)
-    swarm.start()
-    for role, id, _ in rows:
-        wait_for_line(tmp_path / "order.txt", f"+{role}-{id}")
+    swarm = started(swarms, tmp_path, *rows)
     pids = [running.process.pid for running in swarm.running if running.process]
 
     def meanwhile() -> None:
@@ -152,10 +152,7 @@ def test_when_the_end_is_asked_for_twice_all_end_at_once_and_only_who_was_killed
 ) -> None:
     monkeypatch.setattr("launch_scripts.launcher.local_processes.FORCED_GRACE_S", 0.5)
     rows = [("agent", "a0", "stubborn"), ("keeper", "0", "quiet"), ("router", "0", "quiet")]
-    swarm = swarm_of(swarms, tmp_path, *rows)
-    swarm.start()
-    for line in ("+agent-a0", "+keeper-0", "+router-0"):
-        wait_for_line(tmp_path / "order.txt", line)
+    swarm = started(swarms, tmp_path, *rows)
     began_s = time.monotonic()
     failures = swarm.stop(lambda: time.sleep(0.02), force=lambda: time.monotonic() > began_s + 0.1)
     assert failures == []
@@ -201,9 +198,7 @@ def test_a_monitor_that_is_refused_is_tried_once_a_minute_and_ends_nothing(tmp_p
 
 
 def test_who_fails_while_ending_is_named(swarms: list[LocalSwarm], tmp_path: Path) -> None:
-    swarm = swarm_of(swarms, tmp_path, ("keeper", "0", "fail_at_the_end"))
-    swarm.start()
-    wait_for_line(tmp_path / "order.txt", "+keeper-0")
+    swarm = started(swarms, tmp_path, ("keeper", "0", "fail_at_the_end"))
     (failure,) = swarm.stop(lambda: time.sleep(0.02))
     assert failure == "keeper-0 was asked to end, but RuntimeError: could not write the last page"
 
@@ -231,12 +226,12 @@ def test_a_process_begins_once_what_it_waits_for_is_so_and_not_at_all_after_the_
     agent.begins_when = lambda: "a0" in allowed
     other.begins_when = lambda: "a1" in allowed
     swarm.start()
-    wait_for_line(tmp_path / "order.txt", "+keeper-0")
+    wait_for_start(tmp_path, "keeper-0")
     assert swarm.poll() == []
     assert [each.alive for each in swarm.running] == [True, False, False]
     allowed.append("a0")
     assert swarm.poll() == []
-    wait_for_line(tmp_path / "order.txt", "+agent-a0")
+    wait_for_start(tmp_path, "agent-a0")
     assert swarm.stop() == []
     allowed.append("a1")
     assert swarm.poll() == []

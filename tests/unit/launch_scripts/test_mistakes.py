@@ -128,7 +128,7 @@ def test_a_mistake_is_answered_with_what_to_do(
 ) -> None:
     monkeypatch.setattr(LocalSwarm, "start", _no_process)
     monkeypatch.setattr(forkserver, "start_forkserver", lambda *args: None)
-    monkeypatch.setattr(WarmUp, "begin", lambda self: None)
+    monkeypatch.setattr(WarmUp, "_run", lambda self: None)
     monkeypatch.setattr(shared_options, "_CONNECT_S", 0.3)
     # Neither who else listens here nor how large this machine is has a part in it.
     if mistake.get("given") != "port_taken":

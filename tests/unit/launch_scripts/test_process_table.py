@@ -1,8 +1,8 @@
 """The processes that a launcher starts, their order, and the wait before a restart."""
 
-from launch_scripts.launcher.local_processes import Backoff
+from launch_scripts.launcher.local_processes import Running
 from launch_scripts.launcher.run_options import chosen_processes
-from launch_scripts.process_table import ROLES, STOP_ORDER, processes_of
+from launch_scripts.process_table import ROLES, STOP_ORDER, ProcessSpec, processes_of
 from swarm.config.load import parse_scenario
 from swarm.config.scenario import Scenario, StandbyConfig, TargetConfig
 
@@ -43,6 +43,6 @@ def test_the_router_starts_first_and_ends_last() -> None:
 
 
 def test_the_wait_before_a_restart_doubles_to_five_seconds_and_is_short_again_after_a_good_run() -> None:
-    backoff = Backoff()
-    assert [backoff.crashed(ran_s=0.0) for _ in range(7)] == [0.2, 0.4, 0.8, 1.6, 3.2, 5.0, 5.0]
-    assert backoff.crashed(ran_s=60.0) == 0.2
+    running = Running(ProcessSpec("planner", "t0"))
+    assert [running.crashed(ran_s=0.0) for _ in range(7)] == [0.2, 0.4, 0.8, 1.6, 3.2, 5.0, 5.0]
+    assert running.crashed(ran_s=60.0) == 0.2

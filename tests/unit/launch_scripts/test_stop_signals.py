@@ -67,7 +67,7 @@ def test_a_closed_terminal_ends_in_order_however_often_it_says_so(clock: Callabl
         clock(1.0)
     assert asked
     assert not asked.force()
-    assert asked.interruptible_once_more(lambda: "report") == "report"
+    assert asked.interruptible(lambda: "report", anew=True) == "report"
 
 
 def test_nohup_stays_in_force() -> None:
@@ -85,9 +85,9 @@ def test_the_report_is_written_after_two_signals_and_left_by_one_more(clock: Cal
         clock(1.0)
         return "report"
 
-    assert asked.interruptible_once_more(work) == "report", "the first asks for the end only"
-    assert asked.interruptible_once_more(work) is None
-    assert asked.interruptible_once_more(lambda: "report") == "report"
+    assert asked.interruptible(work, anew=True) == "report", "the first asks for the end only"
+    assert asked.interruptible(work, anew=True) is None
+    assert asked.interruptible(lambda: "report", anew=True) == "report"
 
 
 _TALKER = """

@@ -34,7 +34,6 @@ def begun(swarm: SwarmModel) -> tuple[Watcher, list[object]]:
     record = recorder.heard
     recorder.heard = lambda message, *rest: (heard.append(message), record(message, *rest))[1]  # type: ignore[method-assign]
     watcher = Watcher(swarm.bus("launcher"), recorder, swarm.scheduler.clock)
-    watcher.begin()
     return watcher, heard
 
 
@@ -126,7 +125,6 @@ class Part:
         grid = self.swarm.terrain.grid
         self.known: Any = Recorder(SCENARIO, grid, 0) if records else OwnPart(grid, 0)
         self.watcher = Watcher(self.swarm.bus("launcher"), self.known, self.swarm.scheduler.clock)
-        self.watcher.begin()
         self.watcher.look_after(own)
         self.buses = {spec: self.swarm.bus(spec.name) for spec in PROCESSES}
         self.said = 0
