@@ -149,7 +149,7 @@ def _check(scenario: Scenario, hosts: HostsConfig) -> None:
         # One machine carries a scenario's standbys, too: they cover for a process that hangs.
         found, wanted = sum(role in host.roles for host in hosts.hosts), 1 if alone else more + 1
         if found < wanted:
-            why = f"survive = {more}" if role == KEEPER else f"{more} standbys of each process of it"
+            why = f"survive = {more}" if role == KEEPER else f"each process of it has {more} standbys"
             because = f", because {why}: no two share a machine" if wanted > 1 else ""
             raise ConfigError(
                 f"hosts: {role!r} is among the roles of {found} machines, expected at least {wanted}{because}"

@@ -99,19 +99,26 @@ class Simulation:
         self.after_boot: list[Callable[[Node], None]] = []
         self._phases = random.Random(f"phases/{scenario.seed}")
         for spec in processes_of(scenario, SIMULATED_ROLES):
-            skew_ns = int(self.faults.skews_ms.get(spec.name, 0.0) * 1e6)
-            node = self.node(spec, skew_ns)
-            self.scheduler.at(EPOCH_NS + int(self._phases.random() * BOOT_SPREAD_S * NS_PER_S), node.boot)
+            node = self.node(spec, int(self.faults.skews_ms.get(spec.name, 0.0) * 1e6))
+            self.at(self._phases.random() * BOOT_SPREAD_S, node.boot)
         bus = self.network.bus(OBSERVER, scenario.network.namespace, self.authenticator)
-        clock = self.scheduler.clock
-        observer = RunObserver(bus, lambda event: observer.take(event, clock.now_ns()), self.recorder, RECORDED)
+        observer = RunObserver(bus, lambda event: observer.take(event, self.now_ns), self.recorder, RECORDED)
         observer.subscribe()
         self._plan_faults()
 
     @property
+    def now_ns(self) -> int:
+        """Time of the run's clock, which no process's clock needs to agree with."""
+        return self.scheduler.clock.now_ns()
+
+    @property
     def now_s(self) -> float:
         """Seconds since the run began."""
-        return (self.scheduler.clock.now_ns() - EPOCH_NS) / NS_PER_S
+        return (self.now_ns - EPOCH_NS) / NS_PER_S
+
+    def note(self, what: str, *nodes: str) -> None:
+        """Writes a fault, or a start, into the event log."""
+        self.log.event(self.now_ns, what, ",".join(nodes))
 
     def run_until(self, seconds: float) -> None:
         self.scheduler.run_until(EPOCH_NS + int(seconds * NS_PER_S))
@@ -128,8 +135,8 @@ class Simulation:
 
     def node(self, spec: ProcessSpec, skew_ns: int = 0, name: str | None = None) -> Node:
         """A process more, which has not started yet."""
-        node = Node(self, spec, self._phases.randrange(NS_PER_S), skew_ns, name)
-        self.nodes[node.name] = node
+        name = name or spec.name
+        node = self.nodes[name] = Node(self, spec, name, self._phases.randrange(NS_PER_S), skew_ns)
         return node
 
     def disturbed(self) -> bool:
@@ -144,15 +151,14 @@ class Simulation:
                     node.stop()
                     node.ticking = False
         self.run_until(self.now_s + _STOP_S)
-        self.recorder.finish(self.scheduler.clock.now_ns())
+        self.recorder.finish(self.now_ns)
         for node in self.nodes.values():
             node.end_recording()
 
     def report(self, seconds: float) -> dict[str, Any]:
-        recorder = self.recorder
-        ready_ns = recorder.ready_ns
+        ready_ns = self.recorder.ready_ns
         startup_s = None if ready_ns is None else round((ready_ns - EPOCH_NS) / NS_PER_S, 3)
-        numbers = recorder.report(run_id=self.run_id, seconds=seconds, startup_s=startup_s)
+        numbers = self.recorder.report(run_id=self.run_id, seconds=seconds, startup_s=startup_s)
         return {**numbers, "simulated": True, "deliveries": self.log.deliveries}
 
     def twin(self, name: str) -> None:
@@ -164,7 +170,7 @@ class Simulation:
 
     def step_clock(self, name: str, by_s: float) -> None:
         """Sets the clock of a node's machine; the process that runs there has read it already."""
-        self._note("clock", name)
+        self.note("clock", name)
         if name in self.nodes:  # the planner of a removed target is not there any more
             self.nodes[name].skew_ns += int(by_s * NS_PER_S)
 
@@ -180,8 +186,8 @@ class Simulation:
         for twin in plan.twins:
             self.at(twin.at_s, partial(self.twin, twin.node))
         for partition in plan.partitions:
-            self.at(partition.from_s, partial(self._note, "cut", *partition.nodes))
-            self.at(partition.until_s, partial(self._note, "heal", *partition.nodes))
+            self.at(partition.from_s, partial(self.note, "cut", *partition.nodes))
+            self.at(partition.until_s, partial(self.note, "heal", *partition.nodes))
             if self.links.noticed(partition):
                 lost_s = partition.from_s + self.scenario.network.lease_s
                 self.at(lost_s, partial(self.network.relink, partition.nodes, False))
@@ -192,9 +198,6 @@ class Simulation:
     def at(self, seconds: float, action: Callable[[], None]) -> None:
         """Runs an action at a time (s) after the run began."""
         self.scheduler.at(EPOCH_NS + int(seconds * NS_PER_S), action)
-
-    def _note(self, what: str, *nodes: str) -> None:
-        self.log.event(self.scheduler.clock.now_ns(), what, ",".join(nodes))
 
 
 def run_to_end(

@@ -5,7 +5,6 @@ Obstacles, external vehicles, added agents, zones and orders come and go.
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import random
 from typing import Any
@@ -132,7 +131,7 @@ class Interplay:
             if chance.random() < 0.4:
                 from_s = chance.uniform(4.0, quiet_s - 3.0)
                 cuts.append(Partition(from_s, from_s + chance.choice((0.7, 3.0)), (name,), chance.random() < 0.4))
-        self.plan = plan = dataclasses.replace(plan, partitions=tuple(cuts))
+        self.plan = plan = msgspec.structs.replace(plan, partitions=tuple(cuts))
         self.simulation = simulation = OrderedSimulation(scenario, faults=plan, terrain=terrain)
         self.grid = terrain.grid
         self.open = np.isfinite(terrain.pace_s_per_m).ravel() & np.isfinite(simulation.truth).ravel()
