@@ -270,13 +270,13 @@ class Interplay:
     def _forget_removed(self, node: Node) -> None:
         """A vehicle that has left by its agent's word stands on no cell."""
         if isinstance(node.service, AgentService):
-            obstacles = self.trial._cells.get(node.name, {})
+            obstacles = self.trial._generations[node.name].cells
             gone = node.service._removed | (obstacles.keys() & node.service.agent.holdings._entries.away)
             for id in gone:
                 obstacles.pop(id, None)
             self.removed |= gone
         for robot in self.robots:
-            self.trial._cells[robot.name] = {} if robot.on is None else {robot.name: robot.on}
+            self.trial._generations[robot.name].cells = {} if robot.on is None else {robot.name: robot.on}
 
     def _check_vehicles(self, node: Node) -> None:
         if not isinstance(node.service, AgentService):
