@@ -44,11 +44,10 @@ def authority(folder: Path) -> Authority:
     StoreError where they cannot be read or written, do not belong together, or are not valid today."""
     path, secret = folder / f"{CA}.pem", folder / f"{CA}.key"
     if path.exists():
-        check_signed(path, path, secret)
-        key = _key(secret)
+        certificate, key = check_signed(path, path, secret)
         if not isinstance(key, ec.EllipticCurvePrivateKey):
             raise StoreError(f"{secret} is no key of an elliptic curve; {_NEW_AUTHORITY}")
-        return Authority(_read(path), key)
+        return Authority(certificate, key)
     # Signs certificates and lists of revoked ones, and is for nothing else.
     usage = x509.KeyUsage(False, False, False, False, False, True, True, False, False)
     extensions = {x509.BasicConstraints(ca=True, path_length=0): True, usage: True}
@@ -160,10 +159,9 @@ def may_stay(path: Path, hosts: Sequence[str], called: str) -> bool:
     """Returns True if a certificate is of its folder's authority, matches its key, has this common name and these
     hosts at least, and a third of its time or more is left."""
     try:
-        check_signed(path.with_name(f"{CA}.pem"), path, path.with_suffix(".key"))
+        certificate, _ = check_signed(path.with_name(f"{CA}.pem"), path, path.with_suffix(".key"))
     except StoreError:
         return False
-    certificate = _read(path)
     start, end = certificate.not_valid_before_utc, certificate.not_valid_after_utc
     lasts = end - _in_days(0) >= (end - start) / 3
     wanted = {str(_general_name(host).value) for host in hosts}
@@ -179,10 +177,6 @@ def _certificate(path: Path) -> x509.Certificate:
     return x509.load_pem_x509_certificate(read_bytes(path, FileKind.CERTIFICATE))
 
 
-def _key(path: Path) -> PrivateKeyTypes:
-    return serialization.load_pem_private_key(read_bytes(path, FileKind.CERTIFICATE), None)
-
-
 @contextlib.contextmanager
 def _pem(what: str) -> Iterator[None]:
     """Raises StoreError in place of what cryptography raises of a file that is not in PEM."""
@@ -192,11 +186,12 @@ def _pem(what: str) -> Iterator[None]:
         raise StoreError(f"{what} in PEM: {error}") from error
 
 
-def check_signed(ca: Path, certificate: Path, key: Path) -> None:
-    """Raises StoreError where three files in PEM do not go together: another authority's, another's key, or one of
-    the certificates not valid today."""
+def check_signed(ca: Path, certificate: Path, key: Path) -> tuple[x509.Certificate, PrivateKeyTypes]:
+    """The certificate and the key in two files in PEM. Raises StoreError where they and `ca` do not go together:
+    another authority's, another's key, or one of the certificates not valid today."""
     with _pem(f"{ca}, {certificate} and {key} are not certificates and a key"):
-        authority, own, secret = _certificate(ca), _certificate(certificate), _key(key)
+        authority, own = _certificate(ca), _certificate(certificate)
+        secret = serialization.load_pem_private_key(read_bytes(key, FileKind.CERTIFICATE), None)
     try:
         own.verify_directly_issued_by(authority)
     except (ValueError, TypeError, InvalidSignature) as error:
@@ -210,6 +205,7 @@ def check_signed(ca: Path, certificate: Path, key: Path) -> None:
         start, end = each.not_valid_before_utc, each.not_valid_after_utc
         if not start <= _in_days(0) <= end:
             raise StoreError(f"{path} is good from {start:%Y-%m-%d} to {end:%Y-%m-%d}, not today; {remedy}")
+    return own, secret
 
 
 @contextlib.contextmanager

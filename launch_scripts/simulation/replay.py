@@ -175,8 +175,5 @@ def _outcome(
 def other_versions(recorded: Recorded) -> dict[str, tuple[str, str]]:
     """Package -> (version that it was recorded with, version here), where they differ."""
     here = versions()
-    return {
-        name: (version, here.get(name, "none"))
-        for name, version in recorded.head.versions.items()
-        if version != here.get(name)
-    }
+    both = {name: (version, here.get(name, "none")) for name, version in recorded.head.versions.items()}
+    return {name: (then, now) for name, (then, now) in both.items() if then != now}
