@@ -15,7 +15,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from launch_scripts.check import Finding, Level, failure, warning
-from launch_scripts.deploy.machines_needed import Estimate, swarm_of
+from launch_scripts.deploy.machines_needed import needs_on, swarm_of
 from launch_scripts.observe.run_folder import version_of
 from launch_scripts.process_table import processes_of
 from swarm.config.agent_plan import PLACE_TREES_BYTES, place_trees_bytes, places_of, plan_agents
@@ -97,7 +97,7 @@ def needs_of(scenario: Scenario, cells: int) -> RunNeeds:
     kept = place_trees_bytes(PLACE_TREES_BYTES, classes, cells)
     memory += len(places_of(scenario)) * classes * (kept + cells * _TREE_CELL_BYTES)
     recording = int(min(scenario.seconds / 60 * _RECORDING_BYTES_PER_MINUTE, _MOST_BYTES))
-    taken = Estimate(swarm_of(scenario, cells), standbys).on(1)
+    taken = needs_on(1, swarm_of(scenario, cells), standbys)
     cores, planner_cores = sum(taken.cpu_cores.values()), taken.process["planner"]
     disk = cells * _CELL_BYTES + recording
     return RunNeeds(processes, agents, cores, planner_cores, memory, disk, recording)

@@ -177,7 +177,7 @@ def size(
     side, agents = machines_needed.side_of(vehicles, cells), -(-vehicles // per_agent)
     swarm = machines_needed.Swarm(vehicles=vehicles, targets=targets, agents=agents, side=side, tick_hz=tick_hz)
     machine = machines_needed.Machine(cores, memory, link)
-    found = machines_needed.fewest_machines(machines_needed.Estimate(swarm, standbys), machine)
+    found = machines_needed.fewest_machines(machine, swarm, standbys)
     full = machines_needed.too_much(found, machine)
     beyond = found.machines > 1 or not machines_needed.reaches(swarm)
     if as_json:

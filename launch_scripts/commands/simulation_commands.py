@@ -126,7 +126,7 @@ def _simulate_once(
     log_told = "" if trace is None else f"; event log in {trace}"
     terminal.say(
         f"{scenario.seconds:g} simulated seconds in {took_s:.1f} s: "
-        f"{scenario.seconds / took_s:.1f} times real time, {done.log.deliveries:,} deliveries{log_told}"
+        f"{scenario.seconds / took_s:.1f} times real time, {done.deliveries:,} deliveries{log_told}"
     )
     terminal.say(f"report: {folder / 'report.html'}, numbers: {folder / 'report.json'}")
 

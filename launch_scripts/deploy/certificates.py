@@ -44,18 +44,14 @@ def authority(folder: Path) -> Authority:
     StoreError where they cannot be read or written, do not belong together, or are not valid today."""
     path, secret = folder / f"{CA}.pem", folder / f"{CA}.key"
     if path.exists():
-        check_signed(path, path, secret)
-        key = _key(secret)
+        certificate, key = check_signed(path, path, secret)
         if not isinstance(key, ec.EllipticCurvePrivateKey):
             raise StoreError(f"{secret} is no key of an elliptic curve; {_NEW_AUTHORITY}")
-        return Authority(_read(path), key)
-    key, name = ec.generate_private_key(ec.SECP256R1()), _name("swarm authority")
+        return Authority(certificate, key)
     # Signs certificates and lists of revoked ones, and is for nothing else.
     usage = x509.KeyUsage(False, False, False, False, False, True, True, False, False)
     extensions = {x509.BasicConstraints(ca=True, path_length=0): True, usage: True}
-    certificate = _begun(name, name, key, _in_days(_CA_DAYS), extensions).sign(key, hashes.SHA256())
-    _write(folder, CA, certificate, key)
-    return Authority(certificate, key)
+    return _make(folder, CA, "swarm authority", _in_days(_CA_DAYS), extensions)
 
 
 def issue(
@@ -77,31 +73,35 @@ def issue(
     signer = authority(folder)
     # A certificate is refused once its authority has expired, so it promises no more than that.
     end = min(_in_days(days), signer.certificate.not_valid_after_utc)
-    key = ec.generate_private_key(ec.SECP256R1())
     extensions = {
         x509.BasicConstraints(ca=False, path_length=None): True,
         x509.ExtendedKeyUsage([ExtendedKeyUsageOID.SERVER_AUTH, ExtendedKeyUsageOID.CLIENT_AUTH]): False,
         x509.SubjectAlternativeName([_general_name(host) for host in hosts or [name]]): False,
         x509.AuthorityKeyIdentifier.from_issuer_public_key(signer.key.public_key()): False,
     }
-    begun = _begun(_name(called or name), signer.certificate.subject, key, end, extensions)
-    _write(folder, name, begun.sign(signer.key, hashes.SHA256()), key)
+    _make(folder, name, called or name, end, extensions, signer)
     return path
 
 
-def _begun(
-    subject: x509.Name,
-    issuer: x509.Name,
-    key: ec.EllipticCurvePrivateKey,
+def _make(
+    folder: Path,
+    name: str,
+    called: str,
     end: datetime.datetime,
     extensions: Mapping[x509.ExtensionType, bool],
-) -> x509.CertificateBuilder:
-    """A certificate to be signed. `extensions`: whether software that does not know an extension has to refuse the
-    certificate."""
+    signer: Authority | None = None,
+) -> Authority:
+    """Writes a certificate and its new key, and returns both.
+
+    extensions  whether software that does not know an extension has to refuse the certificate
+    signer      None: it signs itself
+    """
+    key = ec.generate_private_key(ec.SECP256R1())
+    subject = x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, called)])
     builder = (
         x509.CertificateBuilder()
         .subject_name(subject)
-        .issuer_name(issuer)
+        .issuer_name(signer.certificate.subject if signer else subject)
         .public_key(key.public_key())
         .serial_number(x509.random_serial_number())
         .not_valid_before(_in_days(0) - _CLOCKS_DIFFER)
@@ -110,11 +110,14 @@ def _begun(
     )
     for extension, is_critical in extensions.items():
         builder = builder.add_extension(extension, is_critical)
-    return builder
-
-
-def _name(common: str) -> x509.Name:
-    return x509.Name([x509.NameAttribute(NameOID.COMMON_NAME, common)])
+    certificate = builder.sign(signer.key if signer else key, hashes.SHA256())
+    pem, plain = serialization.Encoding.PEM, serialization.NoEncryption()
+    make_folder(folder)
+    # The key first: a certificate never exists without its key.
+    with private_file(folder / f"{name}.key") as file:
+        file.write(key.private_bytes(pem, serialization.PrivateFormat.PKCS8, plain))
+    write_file(folder / f"{name}.pem", certificate.public_bytes(pem))
+    return Authority(certificate, key)
 
 
 def _in_days(days: int) -> datetime.datetime:
@@ -156,10 +159,9 @@ def may_stay(path: Path, hosts: Sequence[str], called: str) -> bool:
     """Returns True if a certificate is of its folder's authority, matches its key, has this common name and these
     hosts at least, and a third of its time or more is left."""
     try:
-        check_signed(path.with_name(f"{CA}.pem"), path, path.with_suffix(".key"))
+        certificate, _ = check_signed(path.with_name(f"{CA}.pem"), path, path.with_suffix(".key"))
     except StoreError:
         return False
-    certificate = _read(path)
     start, end = certificate.not_valid_before_utc, certificate.not_valid_after_utc
     lasts = end - _in_days(0) >= (end - start) / 3
     wanted = {str(_general_name(host).value) for host in hosts}
@@ -175,10 +177,6 @@ def _certificate(path: Path) -> x509.Certificate:
     return x509.load_pem_x509_certificate(read_bytes(path, FileKind.CERTIFICATE))
 
 
-def _key(path: Path) -> PrivateKeyTypes:
-    return serialization.load_pem_private_key(read_bytes(path, FileKind.CERTIFICATE), None)
-
-
 @contextlib.contextmanager
 def _pem(what: str) -> Iterator[None]:
     """Raises StoreError in place of what cryptography raises of a file that is not in PEM."""
@@ -188,11 +186,12 @@ def _pem(what: str) -> Iterator[None]:
         raise StoreError(f"{what} in PEM: {error}") from error
 
 
-def check_signed(ca: Path, certificate: Path, key: Path) -> None:
-    """Raises StoreError where three files in PEM do not go together: another authority's, another's key, or one of
-    the certificates not valid today."""
+def check_signed(ca: Path, certificate: Path, key: Path) -> tuple[x509.Certificate, PrivateKeyTypes]:
+    """The certificate and the key in two files in PEM. Raises StoreError where they and `ca` do not go together:
+    another authority's, another's key, or one of the certificates not valid today."""
     with _pem(f"{ca}, {certificate} and {key} are not certificates and a key"):
-        authority, own, secret = _certificate(ca), _certificate(certificate), _key(key)
+        authority, own = _certificate(ca), _certificate(certificate)
+        secret = serialization.load_pem_private_key(read_bytes(key, FileKind.CERTIFICATE), None)
     try:
         own.verify_directly_issued_by(authority)
     except (ValueError, TypeError, InvalidSignature) as error:
@@ -201,26 +200,12 @@ def check_signed(ca: Path, certificate: Path, key: Path) -> None:
         ) from error
     if secret.public_key() != own.public_key():
         raise StoreError(f"{key} is not the key of {certificate}")
-    _check_today(authority, ca, _NEW_AUTHORITY)
-    _check_today(own, certificate, "make it again with `swarm deploy certs FOLDER NAME --renew`")
-
-
-def _check_today(certificate: x509.Certificate, path: Path, remedy: str) -> None:
-    """Raises StoreError where a certificate is not valid today."""
-    start, end = certificate.not_valid_before_utc, certificate.not_valid_after_utc
-    if not start <= _in_days(0) <= end:
-        raise StoreError(f"{path} is good from {start:%Y-%m-%d} to {end:%Y-%m-%d}, not today; {remedy}")
-
-
-def _write(folder: Path, name: str, certificate: x509.Certificate, key: ec.EllipticCurvePrivateKey) -> None:
-    """Writes the key first: a certificate never exists without its key."""
-    secret = key.private_bytes(
-        serialization.Encoding.PEM, serialization.PrivateFormat.PKCS8, serialization.NoEncryption()
-    )
-    make_folder(folder)
-    with private_file(folder / f"{name}.key") as file:
-        file.write(secret)
-    write_file(folder / f"{name}.pem", certificate.public_bytes(serialization.Encoding.PEM))
+    again = "make it again with `swarm deploy certs FOLDER NAME --renew`"
+    for each, path, remedy in ((authority, ca, _NEW_AUTHORITY), (own, certificate, again)):
+        start, end = each.not_valid_before_utc, each.not_valid_after_utc
+        if not start <= _in_days(0) <= end:
+            raise StoreError(f"{path} is good from {start:%Y-%m-%d} to {end:%Y-%m-%d}, not today; {remedy}")
+    return own, secret
 
 
 @contextlib.contextmanager

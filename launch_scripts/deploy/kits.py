@@ -7,7 +7,7 @@ import os
 import sys
 import tarfile
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from pathlib import Path
 
 import msgspec
@@ -58,7 +58,16 @@ def write_kits(
     folder = out / CERTIFICATES
     revoked = revoked_in(folder)
     authority(folder)
-    _issued(folder, OPERATOR, (), days, revoked)
+
+    def issued(name: str, place: str, hosts: tuple[str, ...] = ()) -> dict[str, Path]:
+        """A certificate and its key, at the place where a process looks for them: those that are there, or new ones
+        if they have to be others or end soon."""
+        path, called = folder / f"{name}.pem", common_name(name, revoked)
+        if not may_stay(path, hosts, called):
+            issue(folder, name, hosts, days, renew=True, called=called)
+        return {f"{CERTIFICATES}/{place}{suffix}": path.with_suffix(suffix) for suffix in (".pem", ".key")}
+
+    issued(OPERATOR, OPERATOR)
     written = []
     for host in plan.hosts:
         scenario, ground = host_scenario(plan, host)
@@ -68,13 +77,12 @@ def write_kits(
         files = {**ground, **plugin_files(plan.scenario), f"{CERTIFICATES}/{CA}.pem": folder / f"{CA}.pem"}
         for process in host.processes:
             reached = (host.address, router_name(host), *THIS_MACHINE) if process.role == ROUTER else ()
-            issued = _issued(folder, process.certificate, reached, days, revoked)
-            files |= _files_of(issued, process.certificate)
+            files |= issued(process.certificate, process.certificate, reached)
         if launcher:
-            files |= _files_of(_issued(folder, host.operator, (), days, revoked), OPERATOR)
+            files |= issued(host.operator, OPERATOR)
         if wheel is not None:
             files[f"wheels/{wheel.name}"] = wheel
-        written.append(_archive(out, host.name, texts, dict(_with_parts(files))))
+        written.append(_archive(out, host.name, texts, files))
     keep_plan(plan, out)
     return written
 
@@ -110,19 +118,6 @@ def _before(out: Path) -> _Before:
         raise StoreError(f"{path} is no plan of `swarm deploy plan`: {error}; write to another folder") from error
 
 
-def _files_of(certificate: Path, name: str) -> dict[str, Path]:
-    """A certificate and its key, under the name by which a process looks for them."""
-    return {f"{CERTIFICATES}/{name}{suffix}": certificate.with_suffix(suffix) for suffix in (".pem", ".key")}
-
-
-def _issued(folder: Path, name: str, hosts: tuple[str, ...], days: int, revoked: tuple[str, ...]) -> Path:
-    """The certificate of a name: the one that is there, or a new one if it has to be another or ends soon."""
-    path, called = folder / f"{name}.pem", common_name(name, revoked)
-    if may_stay(path, hosts, called):
-        return path
-    return issue(folder, name, hosts, days, renew=True, called=called)
-
-
 def _archive(out: Path, name: str, texts: dict[str, str], files: Mapping[str, Path]) -> Path:
     """Only its owner may read it: it holds private keys."""
     path = out / f"{name}.tar.gz"
@@ -145,15 +140,6 @@ def _archive(out: Path, name: str, texts: dict[str, str], files: Mapping[str, Pa
     return path
 
 
-def _with_parts(files: Mapping[str, Path]) -> Iterator[tuple[str, Path]]:
-    """Adds the files that belong to a file by name, as .shp, .dbf and .prj."""
-    for place, source in files.items():
-        yield place, source
-        if place.startswith(f"{GROUND}/"):
-            for part in parts_of(source):
-                yield str(Path(place).with_name(part.name)), part
-
-
 # --- the scenario of a machine: its own endpoints and certificates, files beside it -----------------------------
 
 
@@ -174,6 +160,7 @@ def host_scenario(plan: Plan, host: PlannedHost) -> tuple[Scenario, dict[str, Pa
             )
         place = f"{GROUND}/{folders.setdefault(path.parent, len(folders))}/{path.name}"
         files[place] = path
+        files.update((str(Path(place).with_name(part.name)), part) for part in parts_of(path))
         return place
 
     scenario = with_files(plan.scenario, beside)

@@ -139,22 +139,18 @@ def make_plan(
 
 def _check(scenario: Scenario, hosts: HostsConfig) -> None:
     """Raises ConfigError where too few machines carry a role."""
-    alone, standbys = len(hosts.hosts) == 1, scenario.standbys
+    alone = len(hosts.hosts) == 1
     if alone and hosts.losses:
         raise ConfigError(f"survive: found {hosts.losses} with one machine, expected 0 or more machines")
-    # One machine carries a scenario's standbys, too: they cover for a process that hangs.
-    apart = {
-        KEEPER: (hosts.losses + 1, f"survive = {hosts.losses}"),
-        "planner": (standbys.planner + 1, f"{standbys.planner} standbys of each planner"),
-        "places": (standbys.planner + 1, f"{standbys.planner} standbys of each planner of places"),
-        "targets": (standbys.targets + 1, f"{standbys.targets} standbys of the targets process"),
-    }
-    for role in process_table.ROLES:
-        if process_table.TABLE[role].expendable or not process_table.jobs_of(scenario, role):
+    for role, of in process_table.TABLE.items():
+        if of.expendable or not process_table.jobs_of(scenario, role):
             continue
-        found = sum(role in host.roles for host in hosts.hosts)
-        wanted, why = (1, "") if alone else apart.get(role, (1, ""))
+        standbys = getattr(scenario.standbys, of.standbys) if of.standbys else 0
+        more = hosts.losses if role == KEEPER else standbys
+        # One machine carries a scenario's standbys, too: they cover for a process that hangs.
+        found, wanted = sum(role in host.roles for host in hosts.hosts), 1 if alone else more + 1
         if found < wanted:
+            why = f"survive = {more}" if role == KEEPER else f"each process of it has {more} standbys"
             because = f", because {why}: no two share a machine" if wanted > 1 else ""
             raise ConfigError(
                 f"hosts: {role!r} is among the roles of {found} machines, expected at least {wanted}{because}"
@@ -172,12 +168,11 @@ def _processes(scenario: Scenario, hosts: HostsConfig, cores: Mapping[str, float
     """Every process: of a router one for each machine that may have one, in the order of the machines."""
     vehicles = {plan.id: plan.count for plan in plan_agents(scenario)}
     carried = {role for host in hosts.hosts for role in host.roles}
-    ids = {
-        ROUTER: range(sum(ROUTER in host.roles for host in hosts.hosts)),
-        KEEPER: range(hosts.losses + 1),
-    }
-    named = [(role, str(n)) for role, numbers in ids.items() for n in numbers]
-    named += [(spec.role, spec.id) for spec in process_table.processes_of(scenario, tuple(carried - ids.keys()))]
+    numbers = {ROUTER: sum(ROUTER in host.roles for host in hosts.hosts), KEEPER: hosts.losses + 1}
+    named = [(role, str(n)) for role, many in numbers.items() for n in range(many)]
+    named += [
+        (spec.role, spec.id) for spec in process_table.processes_of(scenario, tuple(carried - numbers.keys()))
+    ]
     of_mean = len(vehicles) / max(sum(vehicles.values()), 1)
     return [
         PlannedProcess(
@@ -221,9 +216,7 @@ def place(
         least = min(free or carrying[process.role], key=lambda host: (load(host) + process.cores) / host.cores)
         placed[least.name].append(process)
 
-    def stays(process: PlannedProcess) -> bool:
-        return process.role == KEEPER and before.get(process.id) in [host.name for host in carrying[KEEPER]]
-
+    stores = [host.name for host in carrying[KEEPER]]
     by_role = {role: [each for each in processes if each.role == role] for role in process_table.ROLES}
     for host, router in zip(carrying[ROUTER], by_role.pop(ROUTER), strict=True):
         placed[host.name].append(router)
@@ -232,8 +225,8 @@ def place(
             for agent, host in zip(by_role[role], _shared_out(by_role[role], carrying[role], load), strict=True):
                 placed[host.name].append(agent)
             continue
-        # First those that stay where they are, so that no other takes their place.
-        for process in sorted(by_role[role], key=lambda process: not stays(process)):
+        # First keepers that stay where they are, so that no other takes their place.
+        for process in sorted(by_role[role], key=lambda each: role == KEEPER and before.get(each.id) not in stores):
             put_apart(process)
     return placed
 

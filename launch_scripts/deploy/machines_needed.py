@@ -17,7 +17,7 @@ from __future__ import annotations
 
 import math
 import tomllib
-from collections.abc import Mapping
+from collections import defaultdict
 from functools import cache
 from pathlib import Path
 
@@ -64,17 +64,6 @@ class Swarm(msgspec.Struct, frozen=True, kw_only=True):
     tick_hz: float
 
 
-class Measured(Swarm, frozen=True, kw_only=True, forbid_unknown_fields=True):
-    """One run of the table: role -> what all its processes together took, as the head of the file says."""
-
-    cpu_ms_per_s: dict[str, float]
-    memory_mb: dict[str, float]
-    messages_in: dict[str, float]
-    messages_out: dict[str, float]
-    bytes_in: dict[str, float]
-    bytes_out: dict[str, float]
-
-
 class Machine(msgspec.Struct, frozen=True):
     """A kind of machine."""
 
@@ -109,9 +98,11 @@ class Needs(msgspec.Struct, frozen=True, kw_only=True):
 
 
 @cache
-def measured_runs() -> list[Measured]:
-    """The table of measured swarms."""
-    return msgspec.convert(tomllib.loads(_RUNS.read_text())["runs"], list[Measured])
+def measured_runs() -> dict[Swarm, dict[str, dict[str, float]]]:
+    """The table of measured swarms: figure -> role -> what all its processes together took, as the head of the file
+    says."""
+    runs = tomllib.loads(_RUNS.read_text())["runs"]
+    return {msgspec.convert(run, Swarm): {figure: run[figure] for figure in _FIGURES} for run in runs}
 
 
 def reaches(swarm: Swarm) -> bool:
@@ -135,78 +126,75 @@ def swarm_of(scenario: Scenario, cells: int | None = None) -> Swarm:
     return Swarm(vehicles=vehicles, targets=targets, agents=agents, side=side, tick_hz=tick_hz)
 
 
+def processes_of_each(swarm: Swarm, standbys: int = 0) -> dict[str, int]:
+    """Role -> number of its processes, with these standbys of each planner."""
+    count = dict.fromkeys((*_SINGLE, *_SPREAD, "router", LAUNCHER), 1)
+    return {**count, "agent": swarm.agents, "planner": swarm.targets * (1 + standbys)}
+
+
+@cache
 def one_process(swarm: Swarm) -> dict[str, dict[str, float]]:
     """Figure -> role -> what one process takes in a swarm of this size."""
     from scipy.interpolate import RBFInterpolator  # a launcher imports this module, and seldom asks
 
     runs = measured_runs()
-    columns = [(figure, role) for figure in _FIGURES for role in getattr(runs[0], figure)]
-    taken = [[getattr(run, figure)[role] / _count(run, role) for figure, role in columns] for run in runs]
-    places = np.array(list(map(_place, runs)))
-    between = RBFInterpolator(places, np.log(taken), kernel="linear", degree=1, smoothing=_SMOOTHING)
-    found: dict[str, dict[str, float]] = {figure: {} for figure in _FIGURES}
-    for (figure, role), value in zip(columns, np.exp(between([_place(swarm)])[0]).tolist(), strict=True):
+    columns = [(figure, role) for figure, taken in next(iter(runs.values())).items() for role in taken]
+    each = [
+        [taken[figure][role] / processes_of_each(run)[role] for figure, role in columns]
+        for run, taken in runs.items()
+    ]
+    places = np.array([msgspec.structs.astuple(size) for size in (*runs, swarm)], np.float64)
+    *measured, here = np.log(places)
+    between = RBFInterpolator(measured, np.log(each), kernel="linear", degree=1, smoothing=_SMOOTHING)
+    found: dict[str, dict[str, float]] = defaultdict(dict)
+    for (figure, role), value in zip(columns, np.exp(between([here])[0]).tolist(), strict=True):
         found[figure][role] = value
     return found
 
 
-class Estimate:
-    """Needs of the processes of one swarm, looked up once for any number of machines."""
+def needs_on(machines: int, swarm: Swarm, standbys: int = 0) -> Needs:
+    """Returns the needs of a swarm on a number of machines, with these standbys of each planner."""
+    spread, count, one = 1 / machines, processes_of_each(swarm, standbys), one_process(swarm)
+    share = {role: one["cpu_ms_per_s"][role] / 1000 for role in count}
 
-    def __init__(self, swarm: Swarm, standbys: int = 0) -> None:
-        self._swarm = swarm
-        self._count = dict.fromkeys((*_SINGLE, *_SPREAD, "router", LAUNCHER), 1)
-        self._count |= {"agent": swarm.agents, "planner": swarm.targets * (1 + standbys)}
-        self._one = one_process(swarm)
-        self._cpu = {role: self._one["cpu_ms_per_s"][role] / 1000 for role in self._count}
-        self._memory_gb = {role: self._one["memory_mb"][role] / 1000 for role in self._count}
+    def here(figure: str, *whole: str) -> float:
+        """Sum over a machine's part of the processes that are shared out, and one process of each of `whole`."""
+        shared = sum(one[figure][role] * count[role] * spread for role in _SPREAD)
+        return shared + sum(one[figure][role] for role in whole)
 
-    def on(self, machines: int) -> Needs:
-        """Returns the needs of the swarm on a number of machines."""
-        spread, count = 1 / machines, self._count
-        cores = {role: self._cpu[role] * count[role] for role in count}
-        shared = spread * (sum(cores[role] for role in _SPREAD) + cores["router"])
-        # A process takes one core at most, and falls behind.
-        single = sum(min(self._cpu[role], 1.0) for role in (*_SINGLE, LAUNCHER))
-        both = self._memory_gb[LAUNCHER] + self._memory_gb["router"]
-        memory = both + spread * sum(self._memory_gb[role] * count[role] for role in _SPREAD)
-        one = self._one
-        messages, first_messages = self._enters(one["messages_in"], one["messages_out"], machines)
-        size, first_size = self._enters(one["bytes_in"], one["bytes_out"], machines)
-        return Needs(
-            size=self._swarm,
-            machines=machines,
-            cpu_cores=cores,
-            process={role: share * spread if role == "router" else share for role, share in self._cpu.items()},
-            machine_cores=shared + (self._cpu[LAUNCHER] if machines == 1 else 0.0),
-            first_cores=shared + single,
-            memory_gb=memory,
-            first_memory_gb=memory + sum(self._memory_gb[role] for role in _SINGLE),
-            link_mbit_per_s=_mbit(size, messages),
-            first_link_mbit_per_s=_mbit(first_size, first_messages),
-            sessions=math.ceil((count["agent"] + count["planner"]) * spread) + len(_SINGLE) + machines,
+    def enters(*whole: str) -> float:
+        """Traffic into a machine from all others, Mbit/s."""
+        messages, size = (
+            (1 - spread)
+            * min(here(f"{what}_in", *whole), sum(each * count[role] for role, each in one[f"{what}_out"].items()))
+            for what in ("messages", "bytes")
         )
+        return 8e-6 * (size + OVERHEAD_BYTES * messages)
 
-    def _enters(self, taken: Mapping[str, float], sent: Mapping[str, float], machines: int) -> tuple[float, float]:
-        """Returns the traffic into each machine per second from all others, and into the first."""
-        elsewhere = 1 - 1 / machines
-        here = self._sum(taken, {role: self._count[role] / machines for role in _SPREAD})
-        most = self._sum(sent, self._count) * elsewhere
+    shared = here("cpu_ms_per_s") / 1000 + spread * share["router"]
+    return Needs(
+        size=swarm,
+        machines=machines,
+        cpu_cores={role: share[role] * count[role] for role in count},
+        process={**share, "router": share["router"] * spread},
+        machine_cores=shared + (share[LAUNCHER] if machines == 1 else 0.0),
+        # A process takes one core at most, and falls behind.
+        first_cores=shared + sum(min(share[role], 1.0) for role in (*_SINGLE, LAUNCHER)),
+        memory_gb=here("memory_mb", "router", LAUNCHER) / 1000,
+        first_memory_gb=here("memory_mb", "router", LAUNCHER, *_SINGLE) / 1000,
+        link_mbit_per_s=enters(),
         # The launcher that records hears what the monitor hears.
-        first = here + sum(taken[role] for role in (*_SINGLE, "monitor"))
-        return min(here * elsewhere, most), min(first * elsewhere, most)
-
-    @staticmethod
-    def _sum(figure: Mapping[str, float], count: Mapping[str, float]) -> float:
-        return sum(each * count.get(role, 0.0) for role, each in figure.items())
+        first_link_mbit_per_s=enters(*_SINGLE, "monitor"),
+        sessions=math.ceil((count["agent"] + count["planner"]) * spread) + len(_SINGLE) + machines,
+    )
 
 
-def fewest_machines(estimate: Estimate, machine: Machine) -> Needs:
+def fewest_machines(machine: Machine, swarm: Swarm, standbys: int = 0) -> Needs:
     """The fewest machines of a kind that carry a swarm. Raises ConfigError if none suffice; it names the full
     resource."""
     machines = 1
     while machines <= MOST_MACHINES:
-        found = estimate.on(machines)
+        found = needs_on(machines, swarm, standbys)
         full = [each for each in too_much(found, machine) if not each.startswith("one ")]
         if not full:
             return found
@@ -232,16 +220,3 @@ def too_much(found: Needs, machine: Machine) -> list[str]:
         for what, taken, share, there, unit in limits
         if taken > share * there
     ]
-
-
-def _count(swarm: Swarm, role: str) -> int:
-    return {"agent": swarm.agents, "planner": swarm.targets}.get(role, 1)
-
-
-def _place(swarm: Swarm) -> list[float]:
-    """Returns the position of a swarm among others: the logarithms of its size."""
-    return [math.log(getattr(swarm, name)) for name in Swarm.__struct_fields__]
-
-
-def _mbit(bytes_per_s: float, messages_per_s: float) -> float:
-    return 8e-6 * (bytes_per_s + OVERHEAD_BYTES * messages_per_s)

@@ -95,21 +95,15 @@ def containers_of(plan: Plan, host: PlannedHost, image: str = "") -> list[Contai
     monitor needs a larger one."""
     version = importlib.metadata.version("terrain-swarm").partition("+")[0]  # a tag has no "+COMMIT"
     base = image or f"terrain-swarm:{version}"
-    return [
-        Container(
-            process,
-            dns_label(process.name),
-            base + ("-all" if process.role == "monitor" else ""),
-            _words(process, plan.run_id),
-        )
-        for process in host.processes
-    ]
-
-
-def _words(process: PlannedProcess, run_id: str) -> list[str]:
-    which = ["--id", process.id, *(() if process.role == ROUTER else ("--run-id", run_id))]
-    told = ["--health-port", str(HEALTH_PORT), "--signals-address", "127.0.0.1", "--log-format", "json"]
-    return ["role", process.role, f"/etc/swarm/{_SCENARIO}", *which, "--runs", "/var/lib/swarm/runs", *told]
+    asked = ["--health-port", str(HEALTH_PORT), "--signals-address", "127.0.0.1", "--log-format", "json"]
+    found = []
+    for process in host.processes:
+        run = () if process.role == ROUTER else ("--run-id", plan.run_id)
+        words = ["role", process.role, f"/etc/swarm/{_SCENARIO}", "--id", process.id, *run]
+        words += ["--runs", "/var/lib/swarm/runs", *asked]
+        tag = "-all" if process.role == "monitor" else ""
+        found.append(Container(process, dns_label(process.name), base + tag, words))
+    return found
 
 
 def compose_files(plan: Plan, host: PlannedHost, image: str = "", revoked: Sequence[str] = ()) -> dict[str, str]:
@@ -165,7 +159,6 @@ def zenohd_config(network: NetworkConfig, plugins: str | None = None) -> dict[st
     With certificates the names in `network.admit` may take part, under the rules of `swarm role router`. Raises
     ConfigError on one that no process can have.
     """
-    secured = network.tls is not None
     text = _rendered(
         "zenohd.json",
         network=msgspec.to_builtins(network),
@@ -173,8 +166,8 @@ def zenohd_config(network: NetworkConfig, plugins: str | None = None) -> dict[st
         most_bytes=MAX_PAYLOAD_BYTES + (1 << 16),
         plugins=plugins,
         storage={"key_expr": MARKS.expression(network.namespace), "volume": "memory"},
-        tls=tls_settings(network.tls) if network.tls is not None else None,
-        access_control=access_control(network.namespace, network.admit, network.revoked) if secured else None,
+        tls=network.tls and tls_settings(network.tls),
+        access_control=network.tls and access_control(network.namespace, network.admit, network.revoked),
         low_pass_filter=low_pass_filter(network.namespace),
     )
     config: dict[str, Any] = json.loads(text)

@@ -5,10 +5,12 @@ Nodes are named as processes are: "keeper-0", "planner-t3", "agent-a1". Times ar
 
 from __future__ import annotations
 
+import math
 import random
-from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Sequence
 from typing import NamedTuple
+
+import msgspec
 
 from launch_scripts.process_table import SIMULATED_ROLES, processes_of
 from swarm.clock import NS_PER_S
@@ -30,8 +32,7 @@ _NS_PER_MS = 1_000_000
 """A unit: plans of faults are written in milliseconds, the simulated clock counts nanoseconds."""
 
 
-@dataclass(frozen=True, slots=True)
-class Partition:
+class Partition(msgspec.Struct, frozen=True):
     """Cuts these nodes off from all others for a while. Among themselves they stay connected.
 
     one_way  the others do not hear them, but they hear the others. After the lease a half-open session is closed.
@@ -44,8 +45,7 @@ class Partition:
     one_way: bool = False
 
 
-@dataclass(frozen=True, slots=True)
-class Crash:
+class Crash(msgspec.Struct, frozen=True):
     """Kills a process as kill -9 does. It starts again after a backoff, or never, as if its machine was lost."""
 
     at_s: float
@@ -53,8 +53,7 @@ class Crash:
     for_good: bool = False
 
 
-@dataclass(frozen=True, slots=True)
-class Hang:
+class Hang(msgspec.Struct, frozen=True):
     """Stops a process's loop for a while. Its session lives on, and messages wait meanwhile."""
 
     from_s: float
@@ -62,8 +61,7 @@ class Hang:
     node: str
 
 
-@dataclass(frozen=True, slots=True)
-class ClockStep:
+class ClockStep(msgspec.Struct, frozen=True):
     """Sets the clock of a process's machine. Seen by its next generation: a process reads the clock at its
     start."""
 
@@ -72,8 +70,7 @@ class ClockStep:
     by_s: float
 
 
-@dataclass(frozen=True, slots=True)
-class Twin:
+class Twin(msgspec.Struct, frozen=True):
     """Starts a second generation of an agent on another machine, while the first may live."""
 
     at_s: float
@@ -95,8 +92,7 @@ class Stop(NamedTuple):
     timed: bool
 
 
-@dataclass(frozen=True, slots=True)
-class FaultPlan:
+class FaultPlan(msgspec.Struct, frozen=True):
     """All faults of one run.
 
     drop        share of messages that are lost
@@ -117,7 +113,7 @@ class FaultPlan:
     quiet_s: float | None = None
     partitions: tuple[Partition, ...] = ()
     crashes: tuple[Crash, ...] = ()
-    skews_ms: Mapping[str, float] = field(default_factory=dict)
+    skews_ms: dict[str, float] = {}
     hangs: tuple[Hang, ...] = ()
     clock_steps: tuple[ClockStep, ...] = ()
     twins: tuple[Twin, ...] = ()
@@ -142,6 +138,7 @@ class FaultyLinks:
         self._chance = chance
         self._began_ns = began_ns
         self._lease_s = lease_s
+        self._quiet_s = math.inf if plan.quiet_s is None else plan.quiet_s
         self._last_ns: dict[tuple[str, str], int] = {}
         self._held: dict[str, tuple[int, int]] = {}
         """Stopped node -> how many messages it sends before the stop, and until when that lasts."""
@@ -153,7 +150,7 @@ class FaultyLinks:
     def stop(self, now_ns: int) -> Stop | None:
         """Draws whether a process is stopped in a call that begins now, and where."""
         plan, chance = self._plan, self._chance
-        if not plan.stutter or chance.random() >= plan.stutter or self._is_quiet(now_ns):
+        if not plan.stutter or chance.random() >= plan.stutter or self._at_s(now_ns) >= self._quiet_s:
             return None
         lasts_ns = int(chance.choice(_STOPS_S) * chance.uniform(0.5, 1.0) * NS_PER_S)
         sends = chance.choice((None, chance.randrange(20)))
@@ -163,9 +160,9 @@ class FaultyLinks:
         """Holds messages of a node until a time, all but the next `sends`."""
         self._held[node] = sends, until_ns
 
-    def _is_quiet(self, now_ns: int) -> bool:
-        quiet_s = self._plan.quiet_s
-        return quiet_s is not None and (now_ns - self._began_ns) / NS_PER_S >= quiet_s
+    def _at_s(self, now_ns: int) -> float:
+        """Seconds since the run began."""
+        return (now_ns - self._began_ns) / NS_PER_S
 
     def _held_ns(self, source: str, now_ns: int) -> int:
         """Returns the time for which a message of a node waits for the end of its stop."""
@@ -181,13 +178,13 @@ class FaultyLinks:
         plan, chance = self._plan, self._chance
         if OBSERVER in (source, destination):
             return (_NS_PER_MS,)
-        at_s = (now_ns - self._began_ns) / NS_PER_S
+        at_s = self._at_s(now_ns)
         if any(
             _apart(each, source, destination) and self._cut(each, at_s, source in each.nodes)
             for each in plan.partitions
         ):
             return ()
-        quiet = self._is_quiet(now_ns)
+        quiet = at_s >= self._quiet_s
         if not quiet and plan.drop and chance.random() < plan.drop:
             return ()
         delay_ns = int((plan.delay_ms + chance.random() * plan.jitter_ms) * _NS_PER_MS)
@@ -202,7 +199,7 @@ class FaultyLinks:
         return (arrival_ns - now_ns,)
 
     def connected(self, source: str, destination: str, now_ns: int) -> bool:
-        at_s = (now_ns - self._began_ns) / NS_PER_S
+        at_s = self._at_s(now_ns)
         return not any(
             _apart(each, source, destination) and self.noticed(each)
             for each in self._plan.partitions

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import contextlib
 import math
+from collections import defaultdict
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
 from typing import Any
@@ -94,14 +95,17 @@ def missing(has: Sets, wanted: Sets) -> list[tuple[str, int]]:
 class _Generation:
     """Inputs and actions of one generation of an agent.
 
+    cells      vehicle -> where it is. It stays there when the process dies, until the next generation. The cell in
+               which a generation finds a vehicle first is no step
+    replaced   a younger generation drives them
     reports    (obstacle, incarnation) -> the newest report that was delivered to it, and when
     ticked_ns  its last tick; None before the first
-    placed     its vehicles: the place in which it finds one first is no step
     """
 
+    cells: dict[str, int] = field(default_factory=dict)
+    replaced: bool = False
     reports: dict[tuple[str, int], tuple[Obstacle, int]] = field(default_factory=dict)
     ticked_ns: int | None = None
-    placed: set[str] = field(default_factory=set)
 
     def take(self, report: Obstacle, now_ns: int) -> None:
         known, heard_ns = self.reports.get((report.id, report.incarnation), (None, 0))
@@ -148,9 +152,8 @@ class LawBook:
         spawns = spawn_cells(scenario, grid, grounds)
         self._unmoved = {id: cell for each in spawns.values() for id, cell in each.items()}
         """Vehicle -> cell, of those that no process has placed yet."""
-        self._cells: dict[str, dict[str, int]] = {}
-        """Node -> vehicle -> cell. A vehicle stays where it is when its process dies, until that starts again."""
-        self._generations: dict[str, _Generation] = {}
+        self._generations: defaultdict[str, _Generation] = defaultdict(_Generation)
+        """Node -> its newest generation."""
         self._waited: dict[str, tuple[int, float]] = {}
         """Vehicle -> its cell, and the seconds that count since it came there."""
         simulation.after_boot.append(self._booted)
@@ -163,7 +166,6 @@ class LawBook:
 
     def _booted(self, node: Node) -> None:
         # Simulated vehicles are nowhere until the new generation has places for them.
-        self._cells.pop(node.name, None)
         self._generations[node.name] = _Generation()
 
     def _delivered(self, now_ns: int, source: str, destination: str, topic: str, payload: bytes) -> None:
@@ -171,7 +173,7 @@ class LawBook:
             self._trace(now_ns, source, destination, topic, payload)
         if topic == OBSTACLE.name and destination.startswith("agent-"):
             with contextlib.suppress(ProtocolError):  # an invalid report closes nothing
-                self._generations.setdefault(destination, _Generation()).take(decode(payload, Obstacle), now_ns)
+                self._generations[destination].take(decode(payload, Obstacle), now_ns)
 
     def _take_digest(self, event: Event) -> None:
         if isinstance(event, Heard) and isinstance(event.message, Digest) and event.message.role == "keeper":
@@ -185,9 +187,9 @@ class LawBook:
             self.whole_s = now_s
         if not isinstance(node.service, AgentService):
             return
-        agent, now_ns = node.service.agent, simulation.scheduler.clock.now_ns()
-        generation = self._generations.setdefault(node.name, _Generation())
-        cells = self._cells.setdefault(node.name, {})
+        agent, now_ns = node.service.agent, simulation.now_ns
+        generation = self._generations[node.name]
+        cells = generation.cells
         ticked_ns, generation.ticked_ns = generation.ticked_ns or now_ns, now_ns
         ground = self._grounds[agent.plan.group.vehicle_class]
         truth = ground.pace_s_per_m.reshape(-1)
@@ -196,9 +198,8 @@ class LawBook:
                 if not math.isfinite(truth[vehicle.cell]):
                     text = f"lethal entry at {now_s:.2f} s: {id} on cell {vehicle.cell}"
                     self.lethal.append(BrokenLaw("no lethal entry", text, now_s))
-                if id in generation.placed:
+                if id in cells:
                     self.driven_into += self._obstacles_entered(generation, vehicle, ticked_ns)
-            generation.placed.add(id)
             cells[id] = vehicle.cell
             self._unmoved.pop(id, None)
             if self.whole_s is not None and id not in self.routed_s and self._routed(ground, vehicle):
@@ -206,8 +207,7 @@ class LawBook:
             to_go = vehicle.state in _UNDER_WAY and not (agent.stopped(id) or id in agent.shut_in)
             counts_s = 0.0 if disturbed else (now_ns - ticked_ns) / NS_PER_S
             self._wait(vehicle, to_go, counts_s, self._across_m * truth.item(vehicle.cell))
-        if agent.holdings.replaced:
-            cells.clear()  # the younger generation drives them
+        generation.replaced = agent.holdings.replaced
         self._collide()
 
     def _routed(self, ground: TrueTerrain, vehicle: Vehicle) -> bool:
@@ -219,7 +219,7 @@ class LawBook:
 
     def _obstacles_entered(self, generation: _Generation, vehicle: Vehicle, ticked_ns: int) -> Iterator[BrokenLaw]:
         """The obstacles onto which a vehicle has driven since the last tick of its agent."""
-        now_ns, now_s = self.simulation.scheduler.clock.now_ns(), self.simulation.now_s
+        now_ns, now_s = self.simulation.now_ns, self.simulation.now_s
         grid, middle = self.simulation.terrain.grid, self.simulation.terrain.grid.centre_m(vehicle.cell)
         for obstacle, at_ns in generation.reports.values():
             lasts = at_ns <= ticked_ns and now_ns < at_ns + obstacle.lease_s * NS_PER_S
@@ -237,8 +237,9 @@ class LawBook:
 
     def _collide(self) -> None:
         now_s = self.simulation.now_s
+        driven = [each.cells for each in self._generations.values() if not each.replaced]
         on: dict[tuple[int, bool], str] = {}
-        for cells in (self._unmoved, *self._cells.values()):
+        for cells in (self._unmoved, *driven):
             for id, cell in cells.items():
                 other = on.setdefault((cell, id in self._aloft), id)
                 if other != id:
@@ -287,9 +288,8 @@ class LawBook:
         return found
 
     def _marks_lost(self) -> Iterator[BrokenLaw]:
-        store = self.simulation.nodes["keeper-0"].store
-        assert store is not None
-        stored = {(each.author, each.tile): (each.epoch, each.seq) for each in store.load()}
+        held = self.simulation.nodes["keeper-0"].store.load()
+        stored = {(each.author, each.tile): (each.epoch, each.seq) for each in held}
         if lost := missing(stored, self.acknowledged):
             text = f"{len(lost)} acknowledged sets are lost, such as {lost[0]}"
             yield BrokenLaw("acknowledged marks stay", text)

@@ -6,10 +6,10 @@ from __future__ import annotations
 import tempfile
 from collections import Counter
 from collections.abc import Iterator
-from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
-from typing import Any, cast
+from typing import Any, NamedTuple
+
+import msgspec
 
 from launch_scripts.process_table import SIMULATED_ROLES
 from launch_scripts.simulation.simulated_process import built
@@ -33,19 +33,11 @@ from swarm.wire.messages.processes import Stats
 def setup_of(head: Head, folder: Path) -> RoleSetup:
     """Returns the arguments of a recorded process. Raises ConfigError if this version cannot read its scenario, and
     ProtocolError if its recorded counters are not a valid `Stats` message."""
-    return RoleSetup(
-        scenario=parse_scenario(head.scenario),
-        run_id=head.run_id,
-        role=head.role,
-        id=head.id,
-        incarnation=head.incarnation,
-        started_ns=head.started_ns,
-        run_dir=folder,
-        added=head.added,
-        restarts=head.restarts,
-        before=decode(head.before, Stats) if head.before else None,
-        anew=head.anew,
-    )
+    given = msgspec.structs.asdict(head)
+    del given["terrain"], given["versions"]
+    given["scenario"] = parse_scenario(head.scenario)
+    given["before"] = decode(head.before, Stats) if head.before else None
+    return RoleSetup(**given, run_dir=folder)
 
 
 class _Costs:
@@ -60,8 +52,7 @@ class _Costs:
             return PreparedCosts(Path(folder), *self._of).cell_cost
 
 
-@dataclass(frozen=True, kw_only=True)
-class Recorded:
+class Recorded(NamedTuple):
     """One generation of a process, in a file.
 
     generation  which of its generations it is, from 1
@@ -76,8 +67,7 @@ class Recorded:
         return f"{self.head.role}-{self.head.id}"
 
 
-@dataclass(frozen=True, kw_only=True)
-class Replayed:
+class Replayed(NamedTuple):
     """Result of replaying one recording.
 
     outcome  None if it could not be replayed, and `why` says why
@@ -145,44 +135,45 @@ def replay_run(folder: Path, process: str | None = None, until_s: float | None =
     """Feeds the recordings of a run to the services of this build, each in turn. Raises as `recordings_of`."""
     grounds: dict[str, tuple[Terrain, Floats]] = {}
     for recorded in recordings_of(folder, process):
-        outcome, why, head = None, None, recorded.head
+        outcome, why = None, None
         try:
-            setup = setup_of(head, folder)
-            if head.scenario not in grounds:
-                grounds[head.scenario] = _ground(setup)
-            if (here := grounds[head.scenario][0].digest) != head.terrain:
-                raise TerrainError(
-                    f"{recorded.process} was recorded on terrain {head.terrain}, but its scenario makes terrain "
-                    f"{here} here: terrain files or the rules of cost have changed"
-                )
-            make = partial(_rebuilt, setup, grounds[head.scenario])
-            with RecordReader(recorded.path) as reader:
-                outcome = replay(reader, make, setup.scenario.network.namespace, until_s)
+            outcome = _outcome(recorded, folder, grounds, until_s)
         except SwarmError as error:
             why = str(error)
-        yield Replayed(recorded=recorded, outcome=outcome, why=why)
+        yield Replayed(recorded, outcome, why)
 
 
-def _ground(setup: RoleSetup) -> tuple[Terrain, Floats]:
-    """Returns terrain and ground truth of a scenario; prepared files in the run's folder are used."""
-    terrain = load_terrain(setup)
-    load_classes(setup, terrain)
-    return terrain, load_truth(setup, terrain)
+def _outcome(
+    recorded: Recorded, folder: Path, grounds: dict[str, tuple[Terrain, Floats]], until_s: float | None
+) -> Outcome:
+    """Feeds one recording to its service. Raises SwarmError if it cannot be replayed.
 
+    grounds  scenario -> terrain and truth, of those that earlier recordings had; prepared files in the run's folder
+             are used
+    """
+    head, setup = recorded.head, setup_of(recorded.head, folder)
+    if head.scenario not in grounds:
+        terrain = load_terrain(setup)
+        load_classes(setup, terrain)
+        grounds[head.scenario] = terrain, load_truth(setup, terrain)
+    terrain, truth = grounds[head.scenario]
+    if terrain.digest != head.terrain:
+        raise TerrainError(
+            f"{recorded.process} was recorded on terrain {head.terrain}, but its scenario makes terrain "
+            f"{terrain.digest} here: terrain files or the rules of cost have changed"
+        )
 
-def _rebuilt(setup: RoleSetup, ground: tuple[Terrain, Floats], boundary: Replaying) -> Service:
-    """The service of a recorded process. Its own messages are in the recording, too."""
-    terrain, truth = ground
-    nobody: Any = boundary.nobody
-    prepared = cast(PreparedCosts, _Costs(terrain, setup.scenario))
-    return built(setup, terrain, truth, boundary, nobody, nobody, lambda event: None, prepared=prepared)
+    def make(boundary: Replaying) -> Service:
+        nobody: Any = boundary.nobody  # what the process sent itself is in the recording, too
+        outside = _Costs(terrain, setup.scenario) if head.role == "planner" else None
+        return built(setup, terrain, truth, boundary, nobody, nobody, lambda event: None, outside)
+
+    with RecordReader(recorded.path) as reader:
+        return replay(reader, make, setup.scenario.network.namespace, until_s)
 
 
 def other_versions(recorded: Recorded) -> dict[str, tuple[str, str]]:
     """Package -> (version that it was recorded with, version here), where they differ."""
     here = versions()
-    return {
-        name: (version, here.get(name, "none"))
-        for name, version in recorded.head.versions.items()
-        if version != here.get(name)
-    }
+    both = {name: (version, here.get(name, "none")) for name, version in recorded.head.versions.items()}
+    return {name: (then, now) for name, (then, now) in both.items() if then != now}

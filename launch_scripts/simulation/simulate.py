@@ -1,7 +1,12 @@
 """The whole swarm in one process: the same services on a memory network and a manual clock.
 
 A seed decides everything: the same scenario, seed and faults give the same events, byte for byte, on any machine
-with the same versions.
+with the same versions. The event log has a line per delivery and per fault:
+
+    0.301200000 agent-a0 > planner-t3 route 5f3a9c01
+    4.000000000 crash planner-t3
+
+Seconds since the start, source, destination, topic, digest of the payload. Two runs are equal if their logs are.
 """
 
 from __future__ import annotations
@@ -27,32 +32,6 @@ from swarm.config.scenario import Scenario
 from swarm.runtime.process import collected_rarely
 from swarm.wire.access import Authenticator
 
-
-class EventLog:
-    """The event log of a simulation: a line per delivery and per fault.
-
-        0.301200000 agent-a0 > planner-t3 route 5f3a9c01
-        4.000000000 crash planner-t3
-
-    Seconds since the start, source, destination, topic, digest of the payload. Two runs are equal if their logs
-    are. Counts deliveries, and writes them if there is a file."""
-
-    def __init__(self, out: TextIO | None) -> None:
-        self.deliveries = 0
-        self._out = out
-
-    def delivery(self, now_ns: int, source: str, destination: str, topic: str, payload: bytes) -> None:
-        self.deliveries += 1
-        if self._out is not None:
-            digest = blake2s(payload, digest_size=4).hexdigest()
-            self.event(now_ns, f"{source} >", f"{destination} {topic} {digest}")
-
-    def event(self, now_ns: int, what: str, whom: str) -> None:
-        if self._out is not None:
-            whole, rest = divmod(now_ns - EPOCH_NS, NS_PER_S)
-            self._out.write(f"{whole}.{rest:09d} {what} {whom}\n")
-
-
 BOOT_SPREAD_S = 0.3
 _STEPS_PER_S = 10
 """Reports of progress in a simulated second."""
@@ -66,6 +45,7 @@ any more: a longer wait would add nothing but time on the run's clock."""
 class Simulation:
     """A run that tests advance, inspect and disturb. `simulate` runs one to its end.
 
+    trace       where the event log is written
     record_to   folder in which the inputs of every process are recorded; None: they are not
     after_tick  called with a node after each of its ticks, and each time that its vehicles have driven
     after_boot  called with a node after each of its starts
@@ -89,29 +69,44 @@ class Simulation:
         self.truth = build_truth(scenario, self.terrain)
         self.recorder = Recorder(scenario, self.terrain.grid, EPOCH_NS)
         self.scheduler = Scheduler(ManualClock(EPOCH_NS))
-        self.log = EventLog(trace)
+        self.deliveries = 0
+        self._trace = trace
         chance = random.Random(f"simulation/{scenario.seed}")
         self.links = FaultyLinks(self.faults, chance, EPOCH_NS, scenario.network.lease_s)
-        self.network = MemoryNetwork(self.scheduler, self.links, self.log.delivery)
+        self.network = MemoryNetwork(self.scheduler, self.links, self._delivered)
         self.network.proves_names = scenario.network.tls is not None
         self.nodes: dict[str, Node] = {}
         self.after_tick: list[Callable[[Node], None]] = []
         self.after_boot: list[Callable[[Node], None]] = []
         self._phases = random.Random(f"phases/{scenario.seed}")
         for spec in processes_of(scenario, SIMULATED_ROLES):
-            skew_ns = int(self.faults.skews_ms.get(spec.name, 0.0) * 1e6)
-            node = self.node(spec, skew_ns)
-            self.scheduler.at(EPOCH_NS + int(self._phases.random() * BOOT_SPREAD_S * NS_PER_S), node.boot)
+            node = self.node(spec, int(self.faults.skews_ms.get(spec.name, 0.0) * 1e6))
+            self.at(self._phases.random() * BOOT_SPREAD_S, node.boot)
         bus = self.network.bus(OBSERVER, scenario.network.namespace, self.authenticator)
-        clock = self.scheduler.clock
-        observer = RunObserver(bus, lambda event: observer.take(event, clock.now_ns()), self.recorder, RECORDED)
+        observer = RunObserver(bus, lambda event: observer.take(event, self.now_ns), self.recorder, RECORDED)
         observer.subscribe()
         self._plan_faults()
 
     @property
+    def now_ns(self) -> int:
+        """Time of the run's clock, which no process's clock needs to agree with."""
+        return self.scheduler.clock.now_ns()
+
+    @property
     def now_s(self) -> float:
         """Seconds since the run began."""
-        return (self.scheduler.clock.now_ns() - EPOCH_NS) / NS_PER_S
+        return (self.now_ns - EPOCH_NS) / NS_PER_S
+
+    def note(self, what: str, *nodes: str) -> None:
+        """Writes a line into the event log: a fault, a start or a delivery."""
+        if self._trace is not None:
+            whole, rest = divmod(self.now_ns - EPOCH_NS, NS_PER_S)
+            self._trace.write(f"{whole}.{rest:09d} {what} {','.join(nodes)}\n")
+
+    def _delivered(self, now_ns: int, source: str, destination: str, topic: str, payload: bytes) -> None:
+        self.deliveries += 1
+        if self._trace is not None:
+            self.note(f"{source} >", f"{destination} {topic} {blake2s(payload, digest_size=4).hexdigest()}")
 
     def run_until(self, seconds: float) -> None:
         self.scheduler.run_until(EPOCH_NS + int(seconds * NS_PER_S))
@@ -128,8 +123,8 @@ class Simulation:
 
     def node(self, spec: ProcessSpec, skew_ns: int = 0, name: str | None = None) -> Node:
         """A process more, which has not started yet."""
-        node = Node(self, spec, self._phases.randrange(NS_PER_S), skew_ns, name)
-        self.nodes[node.name] = node
+        name = name or spec.name
+        node = self.nodes[name] = Node(self, spec, name, self._phases.randrange(NS_PER_S), skew_ns)
         return node
 
     def disturbed(self) -> bool:
@@ -138,22 +133,19 @@ class Simulation:
 
     def finish(self) -> None:
         """Asks every node to stop, in order, and lets their last messages arrive."""
-        for role in STOP_ORDER:
-            for node in self.nodes.values():
-                if node.spec.role == role:
-                    node.stop()
-                    node.ticking = False
+        for node in sorted(self.nodes.values(), key=lambda node: STOP_ORDER.index(node.spec.role)):
+            node.stop()
+            node.ticking = False
         self.run_until(self.now_s + _STOP_S)
-        self.recorder.finish(self.scheduler.clock.now_ns())
+        self.recorder.finish(self.now_ns)
         for node in self.nodes.values():
             node.end_recording()
 
     def report(self, seconds: float) -> dict[str, Any]:
-        recorder = self.recorder
-        ready_ns = recorder.ready_ns
+        ready_ns = self.recorder.ready_ns
         startup_s = None if ready_ns is None else round((ready_ns - EPOCH_NS) / NS_PER_S, 3)
-        numbers = recorder.report(run_id=self.run_id, seconds=seconds, startup_s=startup_s)
-        return {**numbers, "simulated": True, "deliveries": self.log.deliveries}
+        numbers = self.recorder.report(run_id=self.run_id, seconds=seconds, startup_s=startup_s)
+        return {**numbers, "simulated": True, "deliveries": self.deliveries}
 
     def twin(self, name: str) -> None:
         """Starts a second generation of an agent now, on another machine: with another file, and a clock of its
@@ -164,7 +156,7 @@ class Simulation:
 
     def step_clock(self, name: str, by_s: float) -> None:
         """Sets the clock of a node's machine; the process that runs there has read it already."""
-        self._note("clock", name)
+        self.note("clock", name)
         if name in self.nodes:  # the planner of a removed target is not there any more
             self.nodes[name].skew_ns += int(by_s * NS_PER_S)
 
@@ -180,8 +172,8 @@ class Simulation:
         for twin in plan.twins:
             self.at(twin.at_s, partial(self.twin, twin.node))
         for partition in plan.partitions:
-            self.at(partition.from_s, partial(self._note, "cut", *partition.nodes))
-            self.at(partition.until_s, partial(self._note, "heal", *partition.nodes))
+            self.at(partition.from_s, partial(self.note, "cut", *partition.nodes))
+            self.at(partition.until_s, partial(self.note, "heal", *partition.nodes))
             if self.links.noticed(partition):
                 lost_s = partition.from_s + self.scenario.network.lease_s
                 self.at(lost_s, partial(self.network.relink, partition.nodes, False))
@@ -192,9 +184,6 @@ class Simulation:
     def at(self, seconds: float, action: Callable[[], None]) -> None:
         """Runs an action at a time (s) after the run began."""
         self.scheduler.at(EPOCH_NS + int(seconds * NS_PER_S), action)
-
-    def _note(self, what: str, *nodes: str) -> None:
-        self.log.event(self.scheduler.clock.now_ns(), what, ",".join(nodes))
 
 
 def run_to_end(

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass
 from functools import partial
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING, Any
 
 from launch_scripts.process_table import ProcessSpec
 from launch_scripts.simulation.world.service import TargetsService
@@ -13,7 +14,7 @@ from planner_service.kernel_build import needed_kernels, place_kernels
 from planner_service.kernels.decorators import load
 from planner_service.places_service import PlacesService
 from planner_service.planning_process import Planning
-from planner_service.prepared_costs import PREPARED_COSTS, PreparedCosts
+from planner_service.prepared_costs import PREPARED_COSTS
 from planner_service.service import PlannerService
 from shared_map.array_files import Floats
 from shared_map.keeper.mark_store import KEEPER_STORE, KeeperStore
@@ -25,7 +26,6 @@ from swarm.bus.memory_bus import MemoryBus
 from swarm.bus.scheduler import InlineWorker
 from swarm.clock import NS_PER_S
 from swarm.config.agent_plan import AddedAgent
-from swarm.config.scenario import Scenario
 from swarm.errors import StoreError
 from swarm.recording.record_inputs import Recording
 from swarm.recording.service_boundary import Boundary
@@ -51,13 +51,12 @@ def built(
     bus: Bus,
     worker: Worker,
     post: Post,
-    store: KeeperStore | None = None,
-    promises: PromiseStore | None = None,
-    prepared: PreparedCosts | None = None,
+    outside: Any = None,
 ) -> Service:
     """The service of a process that is simulated or replayed. Raises StoreError on a role that has none.
 
-    store, promises  external objects; None in a replay, which takes recorded readings
+    outside  store of a keeper, promises of an agent, prepared costs of a planner; None: there are none, or a
+             recording has their readings
     """
     bus = boundary.bus(bus)
     match setup.role:
@@ -65,72 +64,67 @@ def built(
             Modules(ZONE_MODULES).wait()
             # In the order of `shared_map.keeper.main`, in which a recording has them.
             modules: Callable[[], bool] | None = boundary.function("modules of zones", None, bool)
-            store = boundary.external(cast(KeeperStore, store), KEEPER_STORE)
-            return KeeperService(setup, terrain, bus, post, store, modules)
+            return KeeperService(setup, terrain, bus, post, boundary.external(outside, KEEPER_STORE), modules)
         case "planner":
             stopwatch: Callable[[], int] | None = boundary.function("stopwatch", None, int)
             kernels: Callable[[], bool] | None = boundary.function("all kernels", None, bool)
-            prepared = boundary.external(prepared, PREPARED_COSTS)
-            worker = boundary.worker(worker)
+            prepared = boundary.external(outside, PREPARED_COSTS)
             for kernel in needed_kernels(setup.scenario):
                 load(kernel)
-            return PlannerService(Planning(setup, terrain, bus, post, worker), kernels, stopwatch, prepared)
+            planning = Planning(setup, terrain, bus, post, boundary.worker(worker))
+            return PlannerService(planning, kernels, stopwatch, prepared)
         case "places":
-            worker = boundary.worker(worker)
             of_places: Callable[[], bool] | None = boundary.function("all kernels", None, bool)
             for kernel in place_kernels(setup.scenario):
                 load(kernel)
-            return PlacesService(Planning(setup, terrain, bus, post, worker), of_places)
+            return PlacesService(Planning(setup, terrain, bus, post, boundary.worker(worker)), of_places)
         case "targets":
             Modules(WAY_MODULES).wait()
             return TargetsService(setup, terrain, truth, bus, post)
         case "agent":
-            promises = boundary.external(cast(PromiseStore, promises), PROMISE_STORE)
-            return AgentService(setup, terrain, truth, bus, post, promises)
+            return AgentService(setup, terrain, truth, bus, post, boundary.external(outside, PROMISE_STORE))
     raise StoreError(f"no process of role {setup.role!r} is simulated or replayed")
 
 
+@dataclass(eq=False)
 class Node:
     """One process, and the place where it is started again.
 
     name      in the network; a second generation of an agent on another machine has a name of its own
+    phase_ns  of its ticks
     skew_ns   by how much the machine's clock is wrong; a process reads it once, at its start
+    added     the vehicles that it hosts, if it is an agent that is not in the scenario
+    retired   True if it never starts again
+    service   None while it does not run
+    store     of a keeper or an agent: it outlives a crash
     """
 
-    def __init__(
-        self,
-        simulation: Simulation,
-        spec: ProcessSpec,
-        phase_ns: int,
-        skew_ns: int,
-        name: str | None = None,
-    ) -> None:
-        self.spec = spec
-        self.name = name or spec.name
-        self.ticking = True
-        self.crashes = 0
-        self.service: Service | None = None
-        self._shell: Service | None = None
-        """The service, or what records its calls."""
-        self._recording: Recording | None = None
-        """Recording of this generation."""
-        self.bus: MemoryBus | None = None
-        self.store: KeeperStore | None = None
-        self.promises: PromiseStore | None = None
-        self.skew_ns = skew_ns
-        self.retired = False
-        """True if it never starts again."""
-        self.added: AddedAgent | None = None
-        """Vehicles that it hosts, if it is an agent that is not in the scenario."""
-        self._simulation = simulation
-        self._clock = simulation.scheduler.clock
-        self._tick_ns = int(NS_PER_S / _tick_hz(spec.role, simulation.scenario))
-        self._phase_ns = phase_ns % self._tick_ns
-        self._offset_ns = skew_ns
-        self._generation = 0
-        self._waiting: list[Event] | None = None
-        """Events since the process hangs; None if it does not."""
-        self._worker: InlineWorker | None = None
+    simulation: Simulation
+    spec: ProcessSpec
+    name: str
+    phase_ns: int
+    skew_ns: int
+    added: AddedAgent | None = None
+    retired: bool = False
+    ticking: bool = True
+    crashes: int = 0
+    service: Service | None = None
+    bus: MemoryBus | None = None
+    store: Any = None
+    _shell: Service | None = None
+    """The service, or what records its calls."""
+    _recording: Recording | None = None
+    _worker: InlineWorker | None = None
+    _waiting: list[Event] | None = None
+    """Events since the process hangs; None if it does not."""
+    _offset_ns: int = 0
+    _generation: int = 0
+
+    def __post_init__(self) -> None:
+        planner, vehicles = self.simulation.scenario.planner, self.simulation.scenario.vehicles
+        tick_hz = {"planner": planner.tick_hz, "places": planner.tick_hz, "agent": vehicles.tick_hz}
+        self._tick_ns = int(NS_PER_S / tick_hz.get(self.spec.role, 10.0))
+        self.phase_ns %= self._tick_ns
 
     @property
     def works(self) -> bool:
@@ -139,14 +133,14 @@ class Node:
 
     def now_ns(self) -> int:
         """Time of this process's clock."""
-        return self._clock.now_ns() + self._offset_ns
+        return self.simulation.now_ns + self._offset_ns
 
     def boot(self) -> None:
         """Starts a new incarnation."""
         if self.bus is not None or self.retired:
             return
-        simulation = self._simulation
-        simulation.log.event(self._clock.now_ns(), "boot", self.name)
+        simulation = self.simulation
+        simulation.note("boot", self.name)
         self._offset_ns = self.skew_ns
         self._waiting = None
         # Counted as by the launcher: a restart is the later generation even if the clock was set back meanwhile.
@@ -156,7 +150,7 @@ class Node:
         worker = self._worker = InlineWorker(simulation.scheduler)
 
         def post(event: Event) -> None:
-            if self.bus is bus and self._shell is not None:
+            if self.bus is bus:
                 self._take(event)
 
         setup = RoleSetup(
@@ -170,47 +164,37 @@ class Node:
             restarts=self.crashes,
             before=simulation.recorder.observed.newest_stats(self.spec.role, self.spec.id),
         )
-        boundary = Boundary()
-        if simulation.record_to is not None:
-            boundary = self._recording = Recording(setup, simulation.terrain.digest, simulation.record_to)
-        if self.spec.role == "keeper":
-            self.store = self.store or KeeperStore(":memory:")
-        if self.spec.role == "agent":
-            self.promises = self.promises or PromiseStore(self._phase_ns + self._generation)
-        self.service = built(
-            setup,
-            simulation.terrain,
-            simulation.truth,
-            boundary,
-            bus,
-            worker,
-            post,
-            self.store,
-            self.promises,
-        )
+        terrain, folder = simulation.terrain, simulation.record_to
+        self._recording = Recording(setup, terrain.digest, folder) if folder else None
+        boundary = self._recording or Boundary()
+        if self.store is None and self.spec.role == "keeper":
+            self.store = KeeperStore(":memory:")
+        if self.store is None and self.spec.role == "agent":
+            self.store = PromiseStore(self.phase_ns + self._generation)
+        self.service = built(setup, terrain, simulation.truth, boundary, bus, worker, post, self.store)
         self._shell = boundary.service(self.service)
         self._shell.start(self.now_ns())
         for callback in simulation.after_boot:
             callback(self)
-        simulation.scheduler.after(self._phase_ns, lambda: self._tick(bus))
+        simulation.scheduler.after(self.phase_ns, lambda: self._tick(bus))
 
     def _tick(self, bus: MemoryBus) -> None:
         if self.bus is not bus or self._shell is None:
             return
         if self.ticking and self._waiting is None:
             self._call(bus, self._shell.tick, ticked=True)
-        self._simulation.scheduler.after(self._tick_ns, lambda: self._tick(bus))
+        self.simulation.scheduler.after(self._tick_ns, lambda: self._tick(bus))
 
     def _call(self, bus: MemoryBus, work: Callable[[int], None], *, ticked: bool = False) -> None:
         """Calls the service as `Process` does: inbox, clock, work. It may be stopped anywhere between."""
-        links, scheduler = self._simulation.links, self._simulation.scheduler
-        stop = links.stop(self._clock.now_ns())
+        links, now_ns = self.simulation.links, self.simulation.now_ns
+        stop = links.stop(now_ns)
         bus.gather()
         if stop is None:
             return self._work(work, self.now_ns(), ticked)
         self.hang()
         timed_ns = self.now_ns()
-        until_ns = self._clock.now_ns() + stop.lasts_ns
+        until_ns = now_ns + stop.lasts_ns
         if stop.sends is not None:
             links.hold(self.name, stop.sends, until_ns)
             self._work(work, timed_ns, ticked)
@@ -221,14 +205,14 @@ class Node:
                     self._work(work, timed_ns if stop.timed else self.now_ns(), ticked)
                 self.wake()
 
-        scheduler.at(until_ns, go_on)
+        self.simulation.scheduler.at(until_ns, go_on)
         return None
 
     def _work(self, work: Callable[[int], None], now_ns: int, ticked: bool) -> None:
         driven = self._driven
         with in_loop(None):
             work(now_ns)
-        for callback in self._simulation.after_tick if ticked or driven != self._driven else ():
+        for callback in self.simulation.after_tick if ticked or driven != self._driven else ():
             callback(self)
 
     @property
@@ -240,23 +224,26 @@ class Node:
         """Ends the process as kill -9 does: nothing is published or saved."""
         if self.bus is None:
             return
-        self._simulation.log.event(self._clock.now_ns(), "crash", self.name)
+        self.simulation.note("crash", self.name)
         self.crashes += 1
         self.service = self._shell = None
         self.end_recording(ended=False)
-        self._leave()
+        assert self._worker is not None
+        self._worker.close()
+        self.bus.close()
+        self.bus = None
 
     def hang(self) -> None:
         """Stops the process's loop, as a stalled disk does: its session lives, its inbox fills."""
         if self.works:
-            self._simulation.log.event(self._clock.now_ns(), "hang", self.name)
+            self.simulation.note("hang", self.name)
             self._waiting = []
 
     def wake(self) -> None:
         """Ends a hang: everything that has come meanwhile is read at once."""
         waiting, self._waiting = self._waiting or (), None
         if waiting:
-            self._simulation.log.event(self._clock.now_ns(), "wake", self.name)
+            self.simulation.note("wake", self.name)
         for event in waiting:
             self._take(event)  # which may stop it again
 
@@ -277,17 +264,3 @@ class Node:
         if self._recording is not None:
             self._recording.close(ended=ended)
             self._recording = None
-
-    def _leave(self) -> None:
-        if self.bus is not None and self._worker is not None:
-            self._worker.close()
-            self.bus.close()
-            self.bus = None
-
-
-def _tick_hz(role: str, scenario: Scenario) -> float:
-    return {
-        "planner": scenario.planner.tick_hz,
-        "places": scenario.planner.tick_hz,
-        "agent": scenario.vehicles.tick_hz,
-    }.get(role, 10.0)

@@ -11,7 +11,6 @@ import re
 import time
 import traceback
 from collections.abc import Iterator, Mapping
-from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -107,11 +106,6 @@ class Result(msgspec.Struct, frozen=True, kw_only=True):
     wall_s: float
     cpu_s: float
 
-    @property
-    def first(self) -> BrokenLaw | None:
-        """The first law that broke."""
-        return self.broken[0] if self.broken else None
-
 
 def run_trial(trial: Trial) -> Result:
     """Simulates. A service that raises is a broken law; raises SwarmError on what the study, its files or this
@@ -172,9 +166,9 @@ def _with_faults(trial: Trial) -> tuple[Mapping[str, Any], list[BrokenLaw]]:
         terrain = build_terrain(scenario)
     plan = random_plan(scenario, seed, seconds)
     if not plan.hangs and seed % 2:  # a hang would end a stop early
-        plan = replace(plan, stutter=_STUTTER)
+        plan = msgspec.structs.replace(plan, stutter=_STUTTER)
     if seed % 8 in _SLOW_SEEDS:
-        plan = replace(plan, delay_ms=random.Random(f"slow/{seed}").uniform(SLOW_MS, _SLOWEST_MS))
+        plan = msgspec.structs.replace(plan, delay_ms=random.Random(f"slow/{seed}").uniform(SLOW_MS, _SLOWEST_MS))
     simulation = Simulation(scenario, faults=plan, terrain=terrain)
     book = LawBook(simulation)
     try:

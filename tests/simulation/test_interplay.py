@@ -5,7 +5,6 @@ Obstacles, external vehicles, added agents, zones and orders come and go.
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import random
 from typing import Any
@@ -132,7 +131,7 @@ class Interplay:
             if chance.random() < 0.4:
                 from_s = chance.uniform(4.0, quiet_s - 3.0)
                 cuts.append(Partition(from_s, from_s + chance.choice((0.7, 3.0)), (name,), chance.random() < 0.4))
-        self.plan = plan = dataclasses.replace(plan, partitions=tuple(cuts))
+        self.plan = plan = msgspec.structs.replace(plan, partitions=tuple(cuts))
         self.simulation = simulation = OrderedSimulation(scenario, faults=plan, terrain=terrain)
         self.grid = terrain.grid
         self.open = np.isfinite(terrain.pace_s_per_m).ravel() & np.isfinite(simulation.truth).ravel()
@@ -271,13 +270,13 @@ class Interplay:
     def _forget_removed(self, node: Node) -> None:
         """A vehicle that has left by its agent's word stands on no cell."""
         if isinstance(node.service, AgentService):
-            obstacles = self.trial._cells.get(node.name, {})
+            obstacles = self.trial._generations[node.name].cells
             gone = node.service._removed | (obstacles.keys() & node.service.agent.holdings._entries.away)
             for id in gone:
                 obstacles.pop(id, None)
             self.removed |= gone
         for robot in self.robots:
-            self.trial._cells[robot.name] = {} if robot.on is None else {robot.name: robot.on}
+            self.trial._generations[robot.name].cells = {} if robot.on is None else {robot.name: robot.on}
 
     def _check_vehicles(self, node: Node) -> None:
         if not isinstance(node.service, AgentService):

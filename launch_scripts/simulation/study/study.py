@@ -69,7 +69,7 @@ class Study(Section, frozen=True, kw_only=True):
     variants: dict[Shown, Options] = msgspec.field(default_factory=dict)
 
 
-class Case(msgspec.Struct, frozen=True, kw_only=True):
+class Case(msgspec.Struct, frozen=True):
     """A scenario with settings, of which each seed is a trial.
 
     scenario  as the study names it
@@ -168,34 +168,23 @@ def plan(study: Study, base: Path, source: str) -> list[Case]:
     base    folder of the study file; a scenario in it is used instead of a built-in one of the same name
     source  name of the study in error messages
     """
-    return [_planned(study, base, source, *each) for each in combinations(study)]
-
-
-def _planned(
-    study: Study, base: Path, source: str, name: str, variant: str, label: str, settings: dict[str, Any]
-) -> Case:
-    path, given, settled = name, None, ""
-    if name not in SMALL_WORLDS:
-        file = base / name if os.path.isfile(base / name) else scenario_path(name)
-        path = name if file.parent == SCENARIOS else str(file)
-        where = f"{source}: {path} with {label}" if settings else path
-        given = parse_scenario(read_text(file, FileKind.SCENARIO), where, file.parent.absolute(), settings)
-        settled = _digest(_settings(given))
-    seconds = study.seconds or (SECONDS if study.faults or given is None else given.seconds)
-    trials = []
-    for seed in parse_seeds(study.seeds, "seeds"):
-        world = world_of(name, seed) if given is None else given.name
-        key = _digest([code_version(), world, settled, seed, seconds, study.faults])
-        trials.append(Trial(key, world, given, seed, seconds, study.faults, code_version()))
-    return Case(
-        scenario=name,
-        variant=variant,
-        label=label,
-        settings=settings,
-        path=path,
-        given=given,
-        trials=tuple(trials),
-    )
+    seeds, version, cases = parse_seeds(study.seeds, "seeds"), code_version(), []
+    for name, variant, label, settings in combinations(study):
+        path, given, settled = name, None, ""
+        if name not in SMALL_WORLDS:
+            file = base / name if os.path.isfile(base / name) else scenario_path(name)
+            path = name if file.parent == SCENARIOS else str(file)
+            where = f"{source}: {path} with {label}" if settings else path
+            given = parse_scenario(read_text(file, FileKind.SCENARIO), where, file.parent.absolute(), settings)
+            settled = _digest(_settings(given))
+        seconds = study.seconds or (SECONDS if study.faults or given is None else given.seconds)
+        trials = []
+        for seed in seeds:
+            world = world_of(name, seed) if given is None else given.name
+            key = _digest([version, world, settled, seed, seconds, study.faults])
+            trials.append(Trial(key, world, given, seed, seconds, study.faults, version))
+        cases.append(Case(name, variant, label, settings, path, given, tuple(trials)))
+    return cases
 
 
 def _settings(scenario: Scenario) -> Any:

@@ -150,7 +150,14 @@ def summarise(study: Study, cases: Sequence[Case], results: Mapping[str, Result]
             name: {trial.seed: result.figures[name] for trial, result in pairs if name in result.figures}
             for name in study.outcomes or OUTCOMES[study.faults]
         }
-        base = first.setdefault(case.scenario, values)
+        base, outcomes = first.setdefault(case.scenario, values), {}
+        for name, found in values.items():
+            numbers = list(found.values())
+            apart = [value - base[name][seed] for seed, value in found.items() if seed in base[name]]
+            difference = None if base is values else mean(apart)
+            outcomes[name] = Outcome(
+                values=found, mean=mean(numbers), median=median(numbers), difference=difference
+            )
         failures = [_failure(case, trial, result) for trial, result in pairs if result.broken]
         failing += failures
         summaries.append(
@@ -160,9 +167,7 @@ def summarise(study: Study, cases: Sequence[Case], results: Mapping[str, Result]
                 trials=len(pairs),
                 broken=len(failures),
                 share_broken=share(len(failures), len(pairs)) if pairs else None,
-                outcomes={
-                    name: _outcome(found, {} if base is values else base[name]) for name, found in values.items()
-                },
+                outcomes=outcomes,
             )
         )
     every = [trial for case in cases for trial in case.trials]
@@ -177,12 +182,6 @@ def summarise(study: Study, cases: Sequence[Case], results: Mapping[str, Result]
         cases=summaries,
         failing=failing,
     )
-
-
-def _outcome(values: dict[int, float], base: Mapping[int, float]) -> Outcome:
-    numbers = list(values.values())
-    differences = [value - base[seed] for seed, value in values.items() if seed in base]
-    return Outcome(values=values, mean=mean(numbers), median=median(numbers), difference=mean(differences))
 
 
 def _failure(case: Case, trial: Trial, result: Result) -> Failure:
@@ -203,18 +202,11 @@ def _failure(case: Case, trial: Trial, result: Result) -> Failure:
 
 def outcome_table(summary: Summary, name: str) -> str:
     """A row for each case: an outcome, and by what it differs from that of the first case."""
-    rows = [
-        (
-            case.scenario,
-            case.label,
-            str(len(outcome.values)),
-            *_cells(outcome.mean),
-            *_cells(outcome.median),
-            *_cells(outcome.difference, "+"),
-        )
-        for case in summary.cases
-        for outcome in [case.outcomes[name]]
-    ]
+    rows = []
+    for case in summary.cases:
+        outcome = case.outcomes[name]
+        told = (*_cells(outcome.mean), *_cells(outcome.median), *_cells(outcome.difference, "+"))
+        rows.append((case.scenario, case.label, str(len(outcome.values)), *told))
     headings = ("scenario", "case", "n", "mean", "95 %", "median", "95 %", "to the first case", "95 %")
     widths = [max(map(len, column)) for column in zip(headings, *rows, strict=True)]
     first, *rest = (f"| {' | '.join(map(str.ljust, row, widths))} |" for row in (headings, *rows))

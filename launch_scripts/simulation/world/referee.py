@@ -10,8 +10,9 @@ explain do not count."""
 from __future__ import annotations
 
 import math
-from collections.abc import Collection, Container, Iterator, Mapping
+from collections.abc import Collection, Container, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -52,7 +53,7 @@ class Broken:
               that an obstacle hit by its own fault, or that entered a lethal cell
     vehicles  one, or two with a blank between them
     found     the finding in words
-    evidence  the stays which prove it, and where an obstacle was
+    evidence  the stays which prove it
     """
 
     count: str
@@ -60,44 +61,40 @@ class Broken:
     cell: int
     stamp_ns: int
     found: str
-    evidence: tuple[Stay | Cover, ...] = field(compare=False)
+    evidence: tuple[Stay, ...] = field(compare=False)
 
     def sentence(self, began_ns: int) -> str:
         """Returns the finding, and the reports which prove it: when each was on the cell, in seconds since the run
         began, and the reports' numbers and key. A recording of the run has them."""
 
-        def on_cell(each: Stay | Cover) -> str:
+        def on_cell(each: Stay) -> str:
             begin_s, end_s = ((at_ns - began_ns) / NS_PER_S for at_ns in (each.begin_ns, each.end_ns))
             reports = f"reports {each.first_seq} to {each.seq} on {each.key}"
-            name = each.vehicle if isinstance(each, Stay) else f"obstacle {each.obstacle}"
-            return f"{name} from {begin_s:.3f} to {end_s:.3f} s ({reports})"
+            return f"{each.who} from {begin_s:.3f} to {end_s:.3f} s ({reports})"
 
         return f"{self.found}: {' and '.join(map(on_cell, self.evidence))}"
 
 
 @dataclass(slots=True, eq=False)
 class Stay:
-    """A vehicle on a cell, from the first to the last time at which it is known to be there.
+    """A vehicle or an obstacle on a cell, from the first to the last time at which it is known to be there.
 
-    since_ns  the earliest time at which it may have come there
-    region    of the cell: with the author it names the key of the reports
+    who       a vehicle, or "obstacle ID"
+    end_ns    of an obstacle which is there the end of its lease
+    since_ns  the earliest time at which a vehicle may have come there; since when an obstacle has closed the cell
+    key       of the reports, below the namespace
     author    of the last report of it, which has the number `seq`; the first has `first_seq`
     """
 
-    vehicle: str
+    who: str
     cell: int
     begin_ns: int
     end_ns: int
     since_ns: int
-    region: int
+    key: str
     author: str
     seq: int
     first_seq: int
-
-    @property
-    def key(self) -> str:
-        """The key of the reports, below the namespace."""
-        return FLEET.below({"region": str(self.region), "author": self.author})
 
 
 def _started_ns(author: str) -> int:
@@ -118,11 +115,20 @@ Encounters = dict[tuple[str, str], int]
 """Pair -> the last time at which both are known to have been on one cell."""
 
 
-def _is_new(encounters: Encounters, pair: tuple[str, str], until_ns: int) -> bool:
-    """Notes that two were on one cell. True unless they were so a moment ago already."""
-    last_ns = encounters.get(pair)
-    encounters[pair] = until_ns if last_ns is None else max(until_ns, last_ns)
-    return last_ns is None or until_ns - last_ns > _APART_NS
+def _meetings(
+    stay: Stay, others: Iterable[Stay], encounters: Encounters, tolerance_ns: int
+) -> Iterator[tuple[Stay, int]]:
+    """Yields the others that were on a cell together with a stay for longer than a tolerance, each with the end of
+    that time, unless they were so a moment ago already. Notes the encounters."""
+    for other in others:
+        until_ns = min(stay.end_ns, other.end_ns)
+        if other.who == stay.who or until_ns - max(stay.begin_ns, other.begin_ns) <= tolerance_ns:
+            continue
+        pair = min(stay.who, other.who), max(stay.who, other.who)
+        last_ns = encounters.get(pair)
+        encounters[pair] = until_ns if last_ns is None else max(until_ns, last_ns)
+        if last_ns is None or until_ns - last_ns > _APART_NS:
+            yield other, until_ns
 
 
 class Referee:
@@ -163,7 +169,7 @@ class Referee:
         if self._air is not None and fleet.vehicle_class in self._aloft:
             return self._air.on_fleet(fleet)
         broken: list[Broken] = []
-        author, seq, stamp_ns, region = fleet.author, fleet.seq, fleet.stamp_ns, fleet.region
+        author, seq, stamp_ns = fleet.author, fleet.seq, fleet.stamp_ns
         vehicles, stays, covered = self._vehicles, self._stays, self._obstacles.covered
         # In one loop: each vehicle reports in every tick, and all that most of them have to say is that they are
         # still where they were.
@@ -172,7 +178,7 @@ class Referee:
                 continue
             stay = vehicles.get(id)
             if stay is None:
-                self._enter(Stay(id, cell, stamp_ns, stamp_ns, 0, region, author, seq, seq), fleet, broken)
+                broken += self._enter(id, cell, 0, fleet)
                 continue
             before_ns = stay.end_ns
             if stamp_ns <= before_ns:
@@ -186,38 +192,34 @@ class Referee:
             if stands or gapless:
                 stay.end_ns = until_ns
                 if stay.cell in covered or len(stays[stay.cell]) > 1:
-                    broken.extend(self._meetings(stay))
+                    broken += self._met(stay)
             if not (stands and same):
                 since_ns = before_ns if same and not gapless else until_ns
-                self._enter(Stay(id, cell, stamp_ns, stamp_ns, since_ns, region, author, seq, seq), fleet, broken)
+                broken += self._enter(id, cell, since_ns, fleet)
         if stamp_ns - self._swept_ns > NS_PER_S:
             self._sweep(stamp_ns)
         return broken
 
-    def _enter(self, entered: Stay, fleet: Fleet, broken: list[Broken]) -> None:
+    def _enter(self, id: str, cell: int, since_ns: int, fleet: Fleet) -> Iterator[Broken]:
         """A vehicle comes onto a cell."""
-        self._stays.setdefault(entered.cell, []).append(entered)
-        if (left := self._vehicles.get(entered.vehicle)) is not None:
+        author, seq, stamp_ns = fleet.author, fleet.seq, fleet.stamp_ns
+        key = FLEET.below({"region": str(fleet.region), "author": author})
+        entered = Stay(id, cell, stamp_ns, stamp_ns, since_ns, key, author, seq, seq)
+        self._stays.setdefault(cell, []).append(entered)
+        if (left := self._vehicles.get(id)) is not None:
             self._left.append(left)
-        self._vehicles[entered.vehicle] = entered
+        self._vehicles[id] = entered
         truth = self._truths.get(fleet.vehicle_class, self._truths[GROUND])
-        if not truth.item(entered.cell) < math.inf:
-            who = entered.vehicle
-            said, evidence = f"{who} entered a lethal cell", (replace(entered),)
-            broken.append(Broken("lethal_entries", who, entered.cell, fleet.stamp_ns, said, evidence))
+        if not truth.item(cell) < math.inf:
+            yield Broken("lethal_entries", id, cell, stamp_ns, f"{id} entered a lethal cell", (replace(entered),))
 
-    def _meetings(self, stay: Stay) -> Iterator[Broken]:
+    def _met(self, stay: Stay) -> Iterator[Broken]:
+        """The laws that a vehicle's stay on a cell proves broken, by an obstacle or another vehicle there."""
         yield from self._obstacles.check(stay)
-        for other in self._stays.get(stay.cell, ()):
-            overlap_ns = min(stay.end_ns, other.end_ns) - max(stay.begin_ns, other.begin_ns)
-            if other.vehicle == stay.vehicle or overlap_ns <= _SKEW_NS:
-                continue
-            both = (stay, other) if stay.vehicle < other.vehicle else (other, stay)
-            first, second = both[0].vehicle, both[1].vehicle
-            until_ns = min(stay.end_ns, other.end_ns)
-            if _is_new(self._encounters, (first, second), until_ns):
-                evidence, said = (replace(both[0]), replace(both[1])), f"{first} and {second} on one cell"
-                yield Broken("collisions", f"{first} {second}", stay.cell, until_ns, said, evidence)
+        for other, until_ns in _meetings(stay, self._stays[stay.cell], self._encounters, _SKEW_NS):
+            first, second = sorted((stay, other), key=lambda each: each.who)
+            evidence, said = (replace(first), replace(second)), f"{first.who} and {second.who} on one cell"
+            yield Broken("collisions", f"{first.who} {second.who}", stay.cell, until_ns, said, evidence)
 
     def _sweep(self, now_ns: int) -> None:
         """Forgets stays that ended long ago. A vehicle's last stay is kept: it still stands there."""
@@ -237,35 +239,17 @@ _LATE_NS = 3 * NS_PER_S // 20
 """Shorter overlaps are no hit: the referee and an agent may hear of the same report this time after each other."""
 
 
-@dataclass(slots=True, eq=False)
-class Cover:
-    """An obstacle on a cell.
+class _Record(NamedTuple):
+    """The newest report of an obstacle.
 
-    closed_ns  since when it has closed the cell
-    end_ns     while it is there the end of its lease
-    seq        of the last report of it there; the first has `first_seq`
+    covers     cell -> its stay, of the cells on which it is
+    closed_ns  cell -> since when it has been closed, of those that the report closes
     """
 
-    obstacle: str
-    begin_ns: int
-    closed_ns: int
-    end_ns: int
     seq: int
-    first_seq: int
-
-    @property
-    def key(self) -> str:
-        """The key of the reports, below the namespace."""
-        return OBSTACLE.below({"id": self.obstacle})
-
-
-@dataclass(slots=True, eq=False)
-class _Record:
-    seq: int = -1
-    until_ns: int = 0
-    covers: dict[int, Cover] = field(default_factory=dict)
-    closed_ns: dict[int, int] = field(default_factory=dict)
-    """Cell -> since when it has been closed, of those that the newest report closes."""
+    until_ns: int
+    covers: dict[int, Stay]
+    closed_ns: dict[int, int]
 
 
 class ObstacleReferee:
@@ -274,41 +258,40 @@ class ObstacleReferee:
     def __init__(self, grid: GridSpec) -> None:
         self._grid = grid
         self._records: dict[tuple[str, int], _Record] = {}
-        self._covers: dict[int, list[Cover]] = {}
-        self._met: Encounters = {}
+        self._covers: dict[int, list[Stay]] = {}
+        self._encounters: Encounters = {}
         self._swept_ns = 0
 
     def on_obstacle(self, obstacle: Obstacle, now_ns: int) -> None:
         """Takes in a report; one that is no news, or that no agent would avoid, changes nothing."""
-        key = obstacle.id, obstacle.incarnation
-        record = self._records.get(key)
-        if record is None:
-            if len(self._records) >= MOST_OBSTACLES:
-                return
-            record = self._records[key] = _Record()
-        elif obstacle.seq <= record.seq and now_ns < record.until_ns:
+        key, seq = (obstacle.id, obstacle.incarnation), obstacle.seq
+        known = self._records.get(key)
+        if known is None and len(self._records) >= MOST_OBSTACLES:
             return
-        if obstacle.radius_m > MOST_RADIUS_M or obstacle.speed_m_per_s > MOST_M_PER_S:
+        before = known or _Record(-1, 0, {}, {})
+        lasts = now_ns < before.until_ns
+        if (
+            (lasts and seq <= before.seq)
+            or obstacle.radius_m > MOST_RADIUS_M
+            or obstacle.speed_m_per_s > MOST_M_PER_S
+        ):
             return
-        goes_on = now_ns < record.until_ns and obstacle.lease_s > 0.0
-        left, record.covers = record.covers, {}
-        closed_before, record.closed_ns = record.closed_ns if goes_on else {}, {}
-        left_ns, record.until_ns = min(now_ns, record.until_ns), now_ns + int(obstacle.lease_s * NS_PER_S)
-        record.seq = obstacle.seq
+        left = before.covers
+        record = self._records[key] = _Record(seq, now_ns + int(obstacle.lease_s * NS_PER_S), {}, {})
         if obstacle.lease_s > 0.0:
-            closed = capsule_of(obstacle, self._grid, obstacle.speed_m_per_s * REACTION_S).cells(self._grid)
-            record.closed_ns = {cell: closed_before.get(cell, now_ns) for cell in closed}
+            for cell in capsule_of(obstacle, self._grid, obstacle.speed_m_per_s * REACTION_S).cells(self._grid):
+                record.closed_ns[cell] = before.closed_ns.get(cell, now_ns) if lasts else now_ns
             for cell in capsule_of(obstacle, self._grid, 0.0).cells(self._grid):
-                cover = left.pop(cell, None) if goes_on else None
+                cover = left.pop(cell, None) if lasts else None
                 if cover is None:
-                    cover = Cover(
-                        obstacle.id, now_ns, record.closed_ns.get(cell, now_ns), 0, obstacle.seq, obstacle.seq
-                    )
+                    who, since_ns = f"obstacle {obstacle.id}", record.closed_ns.get(cell, now_ns)
+                    below = OBSTACLE.below({"id": obstacle.id})
+                    cover = Stay(who, cell, now_ns, 0, since_ns, below, obstacle.id, seq, seq)
                     self._covers.setdefault(cell, []).append(cover)
-                cover.end_ns, cover.seq = record.until_ns, obstacle.seq
+                cover.end_ns, cover.seq = record.until_ns, seq
                 record.covers[cell] = cover
         for cover in left.values():
-            cover.end_ns = left_ns
+            cover.end_ns = min(now_ns, before.until_ns)
         if not 0 <= now_ns - self._swept_ns < NS_PER_S:
             self._sweep(now_ns)
 
@@ -319,20 +302,17 @@ class ObstacleReferee:
 
     def check(self, stay: Stay) -> Iterator[Broken]:
         """Returns violations proven by a vehicle's stay on a cell."""
-        for cover in self._covers.get(stay.cell, ()):
-            end_ns = min(stay.end_ns, cover.end_ns)
-            if end_ns - max(stay.begin_ns, cover.begin_ns) <= _LATE_NS:
-                continue
-            if _is_new(self._met, (stay.vehicle, cover.obstacle), end_ns):
-                closed_ns, count = stay.since_ns - cover.closed_ns, "hit_by_obstacles"
-                closed_s, obstacle, vehicle = closed_ns / NS_PER_S, f"obstacle {cover.obstacle}", stay.vehicle
-                if closed_ns >= IN_TIME_NS:
-                    count, found = "driven_into", f"{vehicle} drove into {obstacle}, known for {closed_s:.1f} s"
-                elif closed_ns < 0:
-                    found = f"{obstacle} drove into {vehicle}, which was there first"
-                else:
-                    found = f"{obstacle} met {vehicle} {closed_s:.2f} s after its first report"
-                yield Broken(count, vehicle, stay.cell, end_ns, found, (replace(stay), replace(cover)))
+        covers = self._covers.get(stay.cell, ())
+        for cover, until_ns in _meetings(stay, covers, self._encounters, _LATE_NS):
+            closed_ns, count = stay.since_ns - cover.since_ns, "hit_by_obstacles"
+            closed_s, obstacle, vehicle = closed_ns / NS_PER_S, cover.who, stay.who
+            if closed_ns >= IN_TIME_NS:
+                count, found = "driven_into", f"{vehicle} drove into {obstacle}, known for {closed_s:.1f} s"
+            elif closed_ns < 0:
+                found = f"{obstacle} drove into {vehicle}, which was there first"
+            else:
+                found = f"{obstacle} met {vehicle} {closed_s:.2f} s after its first report"
+            yield Broken(count, vehicle, stay.cell, until_ns, found, (replace(stay), replace(cover)))
 
     def _sweep(self, now_ns: int) -> None:
         """Forgets what ended long ago."""
@@ -344,5 +324,5 @@ class ObstacleReferee:
                 del self._covers[cell]
         for key in [key for key, record in self._records.items() if now_ns - record.until_ns > _REMEMBER_NS]:
             del self._records[key]
-        for pair in [pair for pair, met_ns in self._met.items() if now_ns - met_ns > 2 * _REMEMBER_NS]:
-            del self._met[pair]
+        for pair in [pair for pair, met_ns in self._encounters.items() if now_ns - met_ns > 2 * _REMEMBER_NS]:
+            del self._encounters[pair]

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 import random
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 from launch_scripts.simulation.world.walks import TrueTerrain
 from swarm.clock import NS_PER_S
@@ -52,7 +52,7 @@ class Rover:
     rests_s: float = 0.0
     turns: bool = False
     seq: int = 0
-    published_ns: int = field(default=-_PUBLISHED_AGAIN_NS)
+    published_ns: int = -_PUBLISHED_AGAIN_NS
     published: tuple[float, ...] = ()
 
 

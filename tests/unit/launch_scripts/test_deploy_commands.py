@@ -7,12 +7,11 @@ from pathlib import Path
 
 import pytest
 from cryptography import x509
-from cryptography.x509.oid import NameOID
 from typer.testing import CliRunner, Result
 
 from launch_scripts.commands.deploy_commands import app
 from launch_scripts.deploy import certificates
-from launch_scripts.deploy.certificates import THIS_MACHINE, check_signed, hosts_of
+from launch_scripts.deploy.certificates import THIS_MACHINE, called_of, check_signed, hosts_of
 from launch_scripts.launcher.run_options import as_process, tls_of
 from launch_scripts.process_table import LAUNCHER, certificate_names, processes_of
 from swarm.config.load import load_scenario
@@ -38,18 +37,13 @@ def run(*arguments: object) -> Result:
     return CliRunner().invoke(app, list(map(str, arguments)))
 
 
-def common_name(certs: Path, name: str) -> object:
-    made = x509.load_pem_x509_certificate((certs / f"{name}.pem").read_bytes())
-    return made.subject.get_attributes_for_oid(NameOID.COMMON_NAME)[0].value
-
-
 def test_every_process_of_a_scenario_gets_a_certificate_and_finds_its_own(tmp_path: Path, scenario: Path) -> None:
     certs = tmp_path / "certs"
     assert run("certs", certs, "--scenario", scenario, "router.0=10.0.0.1").exit_code == 0
     loaded = load_scenario(scenario)
     names = certificate_names(loaded)
     assert {path.stem for path in certs.glob("*.pem")} == {"ca", *names}
-    assert {common_name(certs, name) for name in names} == set(names)
+    assert {called_of(certs / f"{name}.pem") for name in names} == set(names)
     router = x509.load_pem_x509_certificate((certs / "router.0.pem").read_bytes())
     hosts = router.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
     assert [str(host.value) for host in hosts] == ["10.0.0.1", "localhost", "127.0.0.1"]
@@ -62,7 +56,7 @@ def test_every_process_of_a_scenario_gets_a_certificate_and_finds_its_own(tmp_pa
     loaded = load_scenario(scenario)
     for spec in processes_of(loaded):
         own = as_process(loaded, spec.role, spec.id).network.tls
-        assert common_name(certs, Path(own.certificate).stem) in names
+        assert called_of(Path(own.certificate)) in names
         assert Path(own.key) == Path(own.certificate).with_suffix(".key")
     assert as_process(loaded, LAUNCHER, "0").network.tls != as_process(loaded, "keeper", "0").network.tls
     with pytest.raises(ConfigError, match=r"certs/keeper.west.pem, which keeper.west needs"):
@@ -77,7 +71,7 @@ def test_what_is_there_stays_and_a_revoked_name_gets_its_next_number(tmp_path: P
     assert {path: path.read_bytes() for path in certs.iterdir()} == before
     scenario.write_text(scenario.read_text() + f'revoked = ["{revoked}"]\n')
     assert run("certs", certs, revoked, "--renew", "--scenario", scenario).exit_code == 0
-    assert common_name(certs, revoked) == f"{revoked}~2"
+    assert called_of(certs / f"{revoked}.pem") == f"{revoked}~2"
     changed = {path.stem for path, was in before.items() if path.read_bytes() != was}
     assert changed == {revoked}
 

@@ -9,9 +9,7 @@ from hypothesis import strategies as st
 from typer.testing import CliRunner
 
 from launch_scripts.commands.deploy_commands import app
-from launch_scripts.deploy.machines_needed import Estimate, Machine, Swarm, measured_runs, reaches
-
-WEAK, STRONG = Machine(8, 32, 10_000), Machine(16, 64, 100_000)
+from launch_scripts.deploy.machines_needed import Swarm, measured_runs, needs_on, reaches
 
 
 def swarm(vehicles: int, targets: int, per_agent: int = 200) -> Swarm:
@@ -21,10 +19,9 @@ def swarm(vehicles: int, targets: int, per_agent: int = 200) -> Swarm:
 
 @pytest.mark.parametrize("run", measured_runs(), ids=lambda run: f"{run.vehicles}-{run.targets}-{run.agents}")
 def test_a_measured_swarm_needs_what_it_took(run: Swarm) -> None:
-    found = Estimate(run).on(1)
-    taken = run.cpu_ms_per_s  # type: ignore[attr-defined]
-    assert sum(found.cpu_cores.values()) == pytest.approx(sum(taken.values()) / 1000, rel=0.05)
-    assert found.first_memory_gb == pytest.approx(sum(run.memory_mb.values()) / 1000, rel=0.05)  # type: ignore[attr-defined]
+    found, taken = needs_on(1, run), measured_runs()[run]
+    assert sum(found.cpu_cores.values()) == pytest.approx(sum(taken["cpu_ms_per_s"].values()) / 1000, rel=0.05)
+    assert found.first_memory_gb == pytest.approx(sum(taken["memory_mb"].values()) / 1000, rel=0.05)
     assert reaches(run)
 
 
@@ -34,7 +31,7 @@ def test_a_measured_swarm_needs_what_it_took(run: Swarm) -> None:
     st.sampled_from([1, 2, 7, 30]),
 )
 def test_needs_are_finite_and_positive_and_nothing_crosses_on_one_machine(size: Swarm, machines: int) -> None:
-    found = Estimate(size).on(machines)
+    found = needs_on(machines, size)
     assert all(math.isfinite(each) and each > 0 for each in found.cpu_cores.values())
     assert 0 < found.memory_gb <= found.first_memory_gb < 1e6
     assert found.first_cores >= found.machine_cores > 0

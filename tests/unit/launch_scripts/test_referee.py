@@ -138,7 +138,7 @@ def test_what_ended_long_ago_is_forgotten_and_where_vehicles_stand_is_not() -> N
     for n in range(1, 200):
         referee.on_fleet(a(100 * n, n % 90))
     held = [stay for stays in referee._stays.values() for stay in stays]
-    assert {stay.vehicle for stay in held} == {"a", "b"}
+    assert {stay.who for stay in held} == {"a", "b"}
     # 5 s of cells, ten a second, those of the last second, which are not judged yet, and the two places.
     assert 50 <= len(held) <= 50 + 10 + 2
     reports = [report for n in (200, 201) for report in (a(100 * n, 99), b(100 * n, 99))]
