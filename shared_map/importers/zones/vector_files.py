@@ -6,7 +6,6 @@ pyogrio and shapely are imported where they are used: agents never need them.
 from __future__ import annotations
 
 import contextlib
-import sqlite3
 import warnings
 import zipfile
 from collections.abc import Iterator, Sequence
@@ -107,8 +106,13 @@ def open_layers(path: Path, layer: str | None, what: str) -> list[Layer]:
             raise TerrainError(f"{what} has {len(known)} layers; set layer to one of {shown}")
         found = []
         for name in names:
-            if kind.driver == "GPKG":
-                _check_table(path, source, name, what)
+            if kind.driver == "GPKG":  # a view is a program, which may not end
+                quoted = name.replace("'", "''")
+                held = read(source, sql=f"SELECT type FROM sqlite_master WHERE name = '{quoted}'")[3][0]
+                if held.tolist() not in ([], ["table"]):
+                    raise TerrainError(
+                        f"{what}: layer {name!r} is a {held[0]}, expected a table; ogr2ogr makes a copy of it"
+                    )
             index = listed[:, 0].tolist().index(name)
             info = pyogrio.read_info(source, layer=index, force_feature_count=True)
             count = int(info["features"])
@@ -249,18 +253,3 @@ def _read(path: Path, member: str | None, kind: FileKind = FileKind.VECTOR_TEXT)
         return read_bytes(path, kind)
     with zipfile.ZipFile(path) as archive:
         return archive.read(member)
-
-
-def _check_table(path: Path, source: str | bytes, layer: str, what: str) -> None:
-    """A layer of a GeoPackage must be a table: a view is a program, which may not end."""
-    _, zipped, member = str(source).partition("}/")
-    where = ":memory:" if zipped else path.resolve().as_uri() + "?mode=ro"
-    try:
-        with contextlib.closing(sqlite3.connect(where, uri=True)) as database:
-            if zipped:
-                database.deserialize(_read(path, member))
-            found = database.execute("SELECT type FROM sqlite_master WHERE name = ?", (layer,)).fetchone()
-    except sqlite3.Error as error:
-        raise TerrainError(f"{what} is damaged: {error}") from error
-    if found is not None and found[0] != "table":
-        raise TerrainError(f"{what}: layer {layer!r} is a {found[0]}, expected a table; ogr2ogr makes a copy of it")
