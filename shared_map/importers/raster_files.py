@@ -145,6 +145,8 @@ def _georeferenced(path: Path, what: str, files: contextlib.ExitStack) -> Any:
     import rasterio
     from rasterio.vrt import WarpedVRT
 
+    from shared_map.importers.georeference import system_named
+
     what = f"{what} {path}"
     if (suffix := path.suffix.lower()) in PLAIN:
         from shared_map.importers.plain_grids import read_npz, read_text_grid
@@ -160,7 +162,9 @@ def _georeferenced(path: Path, what: str, files: contextlib.ExitStack) -> Any:
         if not dataset.transform.a > 0 > dataset.transform.e:  # GDAL would mirror the ground
             cell = f"{dataset.transform.a:g} x {-dataset.transform.e:g}"
             raise TerrainError(f"{what}: its header gives a cell {cell}, expected a size above 0")
-        crs = dataset.crs or _system_beside(path, what)
+        crs, beside = dataset.crs, path.with_suffix(".prj")
+        if not crs and beside.is_file():  # which GDAL reads beside some formats only
+            crs = system_named(read_text(beside, FileKind.SYSTEM), f"{what}: {beside}")
         text = Numbers(_text_numbers(dataset, path, what), dataset.transform, crs, (f"a grid as text, {driver}",))
         return in_memory(text, files)
     if dataset.transform.is_identity and dataset.gcps[0]:
@@ -176,14 +180,6 @@ def _check_numbers(dataset: Any, what: str) -> None:
     if 0 in dataset.scales or not np.isfinite([*dataset.scales, *dataset.offsets]).all():
         found = f"scales {dataset.scales[:4]} and offsets {dataset.offsets[:4]}"
         raise TerrainError(f"{what} has {found}, expected finite numbers, and no scale of 0")
-
-
-def _system_beside(path: Path, what: str) -> Any:
-    """The system of a .prj, which GDAL reads beside some formats only."""
-    from shared_map.importers.georeference import system_named
-
-    found = path.with_suffix(".prj")
-    return system_named(read_text(found, FileKind.SYSTEM), f"{what}: {found}") if found.is_file() else None
 
 
 def in_memory(given: Numbers, files: contextlib.ExitStack) -> Any:

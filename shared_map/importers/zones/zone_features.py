@@ -19,8 +19,7 @@ import shapely
 from numpy.typing import NDArray
 
 from shared_map.importers.zones.burn_shapes import POLYGON, Drawn, Placing
-from shared_map.importers.zones.shape_texts import INCLUSION
-from shared_map.importers.zones.vector_files import Features, Layer, open_layers, read_features, unusable
+from shared_map.importers.zones.vector_files import INCLUSION, Features, Layer, open_layers, read_features, unusable
 from shared_map.importers.zones.zone_files import LEAST, MOST, FileFacts
 from swarm.config.ground import WayConfig, ZoneConfig
 from swarm.errors import TerrainError
@@ -42,22 +41,20 @@ class Way:
 
 
 _TABLES = tomllib.loads((Path(__file__).parent / "ways.toml").read_text(encoding="utf-8"))
+_EXTENTS: Mapping[str, Sequence[float]] = _TABLES.pop("extents")
+"""Columns for the extent of points and lines, in any letter case -> (width / value, largest width in metres)."""
 
 
-def _built_in(kind: Kind) -> dict[str, Way]:
-    rows = _TABLES[kind].items()
-    return {name: Way(width_m, None if factor == "lethal" else factor) for name, (width_m, factor) in rows}
-
-
-BUILT_IN: Mapping[Kind, Mapping[str, Way]] = {"road": _built_in("road"), "water": _built_in("water")}
+BUILT_IN: Mapping[str, Mapping[str, Way]] = {
+    kind: {name: Way(width_m, None if factor == "lethal" else factor) for name, (width_m, factor) in rows.items()}
+    for kind, rows in _TABLES.items()
+}
 COLUMNS: Mapping[Kind, tuple[str, ...]] = {
     "road": ("highway", "fclass"),
     "water": ("waterway", "natural", "landuse", "fclass"),
 }
 """Columns of the class: OSM's own keys, and the one of extracts as Shapefiles."""
 TAGS = ("bridge", "tunnel", "area", "inclusion")
-_EXTENTS: Mapping[str, Sequence[float]] = _TABLES["extents"]
-"""Columns for the extent of points and lines, in any letter case -> (width / value, largest width in metres)."""
 PACKED = ("other_tags", "tags")
 """Columns that hold further tags: as GDAL writes them, or JSON."""
 
@@ -129,15 +126,6 @@ def width_of(tags: Mapping[str, str]) -> float | None:
         if max(found) > 0:
             return max(found) * over
     return None
-
-
-def is_bridge(tags: Mapping[str, str]) -> bool:
-    return tags.get("bridge", "no").lower() not in _NOT_A_BRIDGE
-
-
-def is_tunnel(tags: Mapping[str, str]) -> bool:
-    """Returns True if it runs below the ground: a map of one level has no place for it."""
-    return tags.get("tunnel", "no").lower() not in _NO
 
 
 _WIDEST_M = 1000.0
@@ -261,7 +249,8 @@ class _Worth:
                 if is_area:  # it has its own extent
                     tags = {name: value for name, value in tags.items() if not states_extent(name)}
                 way = self._way(tags, features.id(n))
-                bridge = way is not None and self._kind == "road" and is_bridge(tags)
+                over = tags.get("bridge", "no").lower() not in _NOT_A_BRIDGE
+                bridge = way is not None and self._kind == "road" and over
                 self._facts.bridges += bridge
                 inclusion = tags.get(INCLUSION, "yes" if self._zone.kind == "keep_in" else "no").lower()
                 ways[n, is_area] = way, bridge, self._closes and inclusion in ("yes", "true", "1")
@@ -296,7 +285,7 @@ class _Worth:
             way = Way(0.0, zone.value or 1.0)
         if way is None:
             return None
-        if kind is not None and is_tunnel(tags):
+        if kind is not None and tags.get("tunnel", "no").lower() not in _NO:  # a map of one level has no place
             self._facts.skip("below the ground", id)
             return None
         closes = self._closes or (kind == "water" and not name)

@@ -404,6 +404,14 @@ def test_what_is_no_file_is_refused_at_once(tmp_path: Path, name: str) -> None:
         outlines_of(zone, UTM, 256)
 
 
+@pytest.mark.parametrize("before", [b"<?a?>", b"<!---->", b"<!DOCTYPE a>", b" "])
+def test_what_stands_before_the_root_of_an_xml_is_skipped_in_one_way_only(tmp_path: Path, before: bytes) -> None:
+    path = tmp_path / "a.kml"
+    path.write_bytes(before * 500 + b"<svg/>")
+    with pytest.raises(TerrainError, match="is neither GeoJSON"):
+        painted([ZoneConfig(kind="forbidden", file=str(path))])
+
+
 def test_places_in_reverse_are_told_apart_from_places_elsewhere(tmp_path: Path) -> None:
     path = tmp_path / "a.geojson"
     file = geojson(path, [feature(AREA), feature(shapely.box(80, 80, 85, 85)), feature(shapely.box(5, 5, 7, 7))])
