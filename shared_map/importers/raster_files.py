@@ -12,6 +12,7 @@ import glob
 import itertools
 import lzma
 import math
+import os
 import re
 import tomllib
 import warnings
@@ -94,9 +95,9 @@ class Numbers(NamedTuple):
 
 def is_raster(path: Path) -> bool:
     """Returns True if a file begins or is named as a raster that is read."""
-    if path.suffix.lower() in PLAIN:
-        return path.is_file()
     with contextlib.suppress(OSError, TerrainError):
+        if path.suffix.lower() in PLAIN:
+            return path.is_file()
         head, member, _ = beginning(path, tuple(_ZIPPED), FileKind.IMAGE, "")
         return bool(_driver(head, Path(member or path), ""))
     return False
@@ -355,7 +356,7 @@ def _driver(head: bytes, path: Path, what: str) -> str:
     text = head.removeprefix(codecs.BOM_UTF8).lstrip().lower()
     begun = (driver for magic, driver in _DRIVERS.items() if head.startswith(magic) or text.startswith(magic))
     headers = path.with_suffix(".hdr"), Path(f"{path}.hdr")
-    beside = (beginning(each, (), FileKind.IMAGE, what)[0] for each in headers if each.is_file())
+    beside = (beginning(each, (), FileKind.IMAGE, what)[0] for each in headers if os.path.isfile(each))
     envi = ("ENVI" for header in beside if header.startswith(b"ENVI"))
     if found := next(itertools.chain(begun, envi), _NAMELESS.get(path.suffix.lower())):
         return found

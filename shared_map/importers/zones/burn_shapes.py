@@ -130,9 +130,13 @@ class Placing:
                 )
             for n in np.flatnonzero(bounds[:, 2] - bounds[:, 0] > 180):
                 if _jumps(features.shapes[n]):
-                    raise _unusable(what, features, n, "an edge of it spans more than 180 degrees: cut it at 180")
+                    raise unusable(
+                        what,
+                        features.id(features.of[n]),
+                        "an edge of it spans more than 180 degrees: cut it at 180",
+                    )
         for n in np.flatnonzero(self._reversed(bounds)) if self._touched or self._on(bounds).any() else ():
-            raise _unusable(what, features, n, "it is on the terrain only if x and y change places")
+            raise unusable(what, features.id(features.of[n]), "it is on the terrain only if x and y change places")
 
     def place(self, features: Features) -> tuple[NDArray[Any], NDArray[np.int64]]:
         """Simple shapes (points, lines, polygons) in cells, and of which feature each is a part. Raises
@@ -182,10 +186,6 @@ class Placing:
         return shapes, of
 
 
-def _unusable(what: str, features: Features, shape: Any, why: str) -> TerrainError:
-    return unusable(what, features.id(features.of[shape]), why)
-
-
 def _shown(west: float, south: float, east: float, north: float) -> str:
     return f"{west:.7g}, {south:.7g} to {east:.7g}, {north:.7g}"
 
@@ -223,10 +223,10 @@ def _mended(
     wrong = np.flatnonzero(polygons)[~shapely.is_valid(shapes[polygons])]
     for n in wrong:
         if _crossings(shapes[n]) > _MOST_CROSSINGS:
-            raise _unusable(what, features, n, "it crosses itself thousands of times")
+            raise unusable(what, features.id(features.of[n]), "it crosses itself thousands of times")
         shapes[n] = shapely.make_valid(shapes[n], method="structure", keep_collapsed=False)
         if shapely.is_empty(shapes[n]):
-            raise _unusable(what, features, n, "it encloses no ground")
+            raise unusable(what, features.id(features.of[n]), "it encloses no ground")
     simple, within = _simple(shapes[near])
     return simple, features.of[near][within], {features.id(features.of[n]) for n in wrong}
 
