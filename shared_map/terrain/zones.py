@@ -79,14 +79,8 @@ class ZoneFacts:
 
     def as_json(self, cells: int) -> dict[str, Any]:
         """Fields of `--json`; shares are of all cells."""
-        facts: dict[str, Any] = {
-            "name": self.name,
-            "kind": self.kind,
-            "cells": self.cells,
-            "changed": self.changed,
-            "opened": self.opened,
-            "lethal_share": round(self.lethal / cells, 6),
-        }
+        facts = {key: getattr(self, key) for key in ("name", "kind", "cells", "changed", "opened")}
+        facts["lethal_share"] = round(self.lethal / cells, 6)
         if self.file is not None:
             named = {"named": "skipped_ids", "mended": "mended_ids"}
             facts |= {named.get(name, name): value for name, value in vars(self.file).items()}

@@ -190,15 +190,11 @@ def _shown(west: float, south: float, east: float, north: float) -> str:
     return f"{west:.7g}, {south:.7g} to {east:.7g}, {north:.7g}"
 
 
-def _jumps(geometry: Any) -> bool:
-    """Returns True if an edge spans more than half of the globe, and not all of it."""
-    parts, _ = _simple(np.array([geometry], object))
-    for part in parts:
-        for ring in shapely.get_rings(part) if part.geom_type == "Polygon" else [part]:
-            jumps = np.abs(np.diff(shapely.get_coordinates(ring)[:, 0]))
-            if ((jumps > 180) & (jumps < 359.999)).any():
-                return True
-    return False
+def _jumps(shape: Any) -> bool:
+    """Returns True if an edge of a simple shape spans more than half of the globe, and not all of it."""
+    lines = shapely.get_rings(shape) if shape.geom_type == "Polygon" else [shape]
+    wide = np.abs(np.concatenate([np.diff(shapely.get_coordinates(line)[:, 0]) for line in lines]))
+    return bool(((wide > 180) & (wide < 359.999)).any())
 
 
 def _simple(geometries: NDArray[Any]) -> tuple[NDArray[Any], NDArray[np.int64]]:

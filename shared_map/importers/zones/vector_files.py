@@ -142,15 +142,8 @@ def read_features(layer: Layer, columns: Sequence[str]) -> Iterator[Features]:
     wanted = [name for name in dict.fromkeys((*columns, *_IDS)) if name in layer.columns]
     for first in range(0, 1 << 31, _CHUNK):
         with _refused(layer.what), np.errstate(all="ignore"):
-            meta, numbers, stored, fields = read(
-                layer.source,
-                layer=layer.index,
-                columns=wanted,
-                force_2d=True,
-                return_fids=True,
-                skip_features=first,
-                max_features=_CHUNK,
-            )
+            part = {"layer": layer.index, "columns": wanted, "skip_features": first, "max_features": _CHUNK}
+            meta, numbers, stored, fields = read(layer.source, force_2d=True, return_fids=True, **part)
             geometries = shapely.from_wkb(stored, on_invalid="ignore")
             unclosed = np.flatnonzero(shapely.is_missing(geometries))
             geometries[unclosed] = shapely.from_wkb(stored[unclosed], on_invalid="fix")
