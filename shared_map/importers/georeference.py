@@ -203,15 +203,6 @@ def bounds_in(transform: Any, rows: int, cols: int, crs: Any, target: Any) -> tu
     return west, south, east + 360.0 * (target.is_geographic and east < west), north
 
 
-def going_on(crs: Any, transform: Any, rows: int, cols: int) -> Any:
-    """The system of a raster, whose degrees go on beyond 180 if the raster's do: PROJ's do not."""
-    west, _, east, _ = bounds_in(transform, rows, cols, crs, crs)
-    if not crs.is_geographic or -180 <= west <= east <= 180:
-        return crs
-    same = crs.to_proj4().replace("=True", "")
-    return rasterio.CRS.from_proj4(f"{same} +lon_wrap={(west + east) / 2:.9f}")
-
-
 def check_metres(step: float, west: float, what: str) -> None:
     """Raises TerrainError where numbers without a coordinate system look like degrees."""
     if abs(step) < 0.1 and abs(west) <= 180:
@@ -384,7 +375,11 @@ class Placed:
         place = transform_of(grid)
         own = place if self.is_cells else self.transform
         size = {"width": grid.cols, "height": grid.rows, "dtype": "float32", "nodata": math.nan}
-        crs = going_on(self.crs, own, dataset.height, dataset.width)
+        crs = self.crs
+        west, _, east, _ = bounds_in(own, dataset.height, dataset.width, crs, crs)
+        if crs.is_geographic and not -180 <= west <= east <= 180:  # where PROJ's degrees do not go on
+            same = crs.to_proj4().replace("=True", "")
+            crs = rasterio.CRS.from_proj4(f"{same} +lon_wrap={(west + east) / 2:.9f}")
         source = {"src_crs": crs, "src_transform": own, "src_nodata": void}
         # A photo shows nothing only where no band does.
         target = {"crs": self.target, "transform": place, "NUM_THREADS": "ALL_CPUS", "UNIFIED_SRC_NODATA": "YES"}
@@ -415,13 +410,6 @@ def place_on(dataset: Any, grid: GridSpec, given: str | None, what: str, key: st
     target, crs = systems_of(grid, dataset.crs, given, what, key)
     if target is None:
         target = crs = rasterio.CRS.from_wkt(METRES)
-    share = _overlap(dataset, crs, target, grid, what)
-    is_cells = crs == target and same_shape and dataset.transform.almost_equals(transform_of(grid), 1e-3)
-    return Placed(dataset, grid, dataset.transform, crs, target, share, is_cells)
-
-
-def _overlap(dataset: Any, crs: Any, target: Any, grid: GridSpec, what: str) -> float:
-    """Share of the terrain within a file's frame. Raises TerrainError if there is none."""
     with reprojecting(what, crs, target):
         west, south, east, north = bounds_in(dataset.transform, dataset.height, dataset.width, crs, target)
     grid_east = grid.west_m + grid.cols * grid.resolution_m
@@ -433,4 +421,6 @@ def _overlap(dataset: Any, crs: Any, target: Any, grid: GridSpec, what: str) -> 
             f"{what} does not overlap the terrain: it covers x {west:.7g}..{east:.7g}, y {south:.7g}..{north:.7g},"
             f" the terrain x {grid.west_m:.7g}..{grid_east:.7g}, y {grid_south:.7g}..{grid.north_m:.7g}"
         )
-    return wide * high / (grid.rows * grid.cols * grid.resolution_m**2)
+    share = wide * high / (grid.rows * grid.cols * grid.resolution_m**2)
+    is_cells = crs == target and same_shape and dataset.transform.almost_equals(transform_of(grid), 1e-3)
+    return Placed(dataset, grid, dataset.transform, crs, target, share, is_cells)

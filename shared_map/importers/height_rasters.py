@@ -6,7 +6,6 @@ Its numbers may be heights, or codes of land cover.
 from __future__ import annotations
 
 import tomllib
-from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
@@ -17,7 +16,6 @@ import rasterio
 from rasterio.enums import ColorInterp
 from rasterio.transform import Affine, from_origin
 
-from shared_map.array_files import Floats
 from shared_map.importers.cover import land_cover
 from shared_map.importers.cover.land_cover import TABLES, some
 from shared_map.importers.georeference import METRES, Placed, check_metres, crs_of, overruled, plan_grid
@@ -157,10 +155,14 @@ def _heights(
         scale_notes.append("the file has two bands; heights are taken from the first")
     some = sampled(dataset, 1, MOST_SAMPLED).astype(np.float32).filled(np.nan)
     voids, found, looks = looked_at(np.where(np.isfinite(some), some, np.float32(np.nan)), config, factor, offset)
-    if (
-        voids and not placed.is_cells
-    ):  # GDAL warps one value of no height only; of a second one it would make slopes
-        whole = Numbers(_whole(dataset, voids, f"terrain {path}"), placed.transform, placed.crs)
+    if voids and not placed.is_cells:  # of a second value of no height GDAL would make slopes
+        if dataset.height * dataset.width > MAX_CELLS:
+            listed = ", ".join(f"{void:g}" for void in voids)
+            raise TerrainError(
+                f"terrain {path} has undeclared voids ({listed}): gdal_edit.py -a_nodata declares one"
+            )
+        known = np.where(dataset.read_masks(1) > 0, dataset.read(1).astype(np.float32), np.float32(np.nan))
+        whole = Numbers(without(known, voids), placed.transform, placed.crs)
         placed = replace(placed, dataset=in_memory(whole, files))
     stretch = placed.transform @ Affine.scale(dataset.width / found.shape[1], dataset.height / found.shape[0])
     flat = in_memory(Numbers(found.astype(np.float32), stretch, placed.crs), files)
@@ -208,13 +210,3 @@ def _scale_of(dataset: Any, crs: Any, config: TerrainConfig) -> tuple[float, flo
         )
     scale = 1.0 if config.height_scale is None else config.height_scale
     return factor * scale, offset * scale, notes
-
-
-def _whole(dataset: Any, voids: Sequence[float], what: str) -> Floats:
-    """The whole first band, as stored; NaN where there is no height."""
-    if dataset.height * dataset.width > MAX_CELLS:
-        listed = ", ".join(f"{void:g}" for void in voids)
-        raise TerrainError(f"{what} has undeclared voids ({listed}): gdal_edit.py -a_nodata declares one")
-    heights: Floats = dataset.read(1).astype(np.float32)
-    heights[dataset.read_masks(1) == 0] = np.nan
-    return without(heights, voids)

@@ -13,7 +13,7 @@ import math
 import re
 import warnings
 import zipfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
 
@@ -265,24 +265,6 @@ _NO_NUMBERS = (ValueError, IndexError, OverflowError)
 Points = NDArray[np.float64]
 
 
-class _Layout(NamedTuple):
-    """Layout of a text.
-
-    what       names the file in sentences
-    delimiter  between numbers; None is any blank
-    header     number of the line that names columns; 0 if there is none
-    columns    of x, y and z
-    degrees    whether x and y are longitude and latitude
-    """
-
-    path: Path
-    what: str
-    delimiter: str | None
-    header: int = 0
-    columns: tuple[int, int, int] = (0, 1, 2)
-    degrees: bool = False
-
-
 def read_text_grid(path: Path, what: str) -> Numbers:
     """Heights of a text.
 
@@ -306,9 +288,9 @@ def read_text_grid(path: Path, what: str) -> Numbers:
         If the file cannot be read or is no text, a line holds what is no number, or the points lie on no regular
         grid.
     """
-    layout, total = _layout(path, what), 0
-    xs = ys = np.zeros(0)
-    for part in _numbers(layout):
+    points, is_degrees = _points_of(path, what)
+    total, xs, ys = 0, np.zeros(0), np.zeros(0)
+    for part in points():
         xs, ys = (np.unique(np.concatenate((known, part[:, n]))) for n, known in ((0, xs), (1, ys)))
         if not ((np.abs(xs) <= _FURTHEST).all() and (np.abs(ys) <= _FURTHEST).all()):
             raise TerrainError(f"{what}: a point has no x or no y, or one beyond {_FURTHEST:g}")
@@ -321,7 +303,7 @@ def read_text_grid(path: Path, what: str) -> Numbers:
         raise _irregular(what, f"{total} points are {total / cells:.1%} of a grid of {steps}")
     check_size(down.cells, across.cells, what)
     heights = np.full(cells, np.nan, np.float32)
-    for part in _numbers(layout):  # a second time: to hold the points would take ten times their grid
+    for part in points():  # a second time: to hold the points would take ten times their grid
         col = np.rint((part[:, 0] - across.first) / across.step).astype(np.intp)
         row = np.rint((down.last - part[:, 1]) / down.step).astype(np.intp)
         at = row * across.cells + col
@@ -339,63 +321,59 @@ def read_text_grid(path: Path, what: str) -> Numbers:
         notes.append(f"{missing} points of the grid ({missing / cells:.1%}) are missing or have no height: voids")
     west, north = across.first - across.step / 2, down.last + down.step / 2
     place = from_origin(west, north, across.step, down.step)
-    crs = CRS.from_epsg(4326) if layout.degrees else None
+    crs = CRS.from_epsg(4326) if is_degrees else None
     return Numbers(heights.reshape(down.cells, across.cells), place, crs, tuple(notes))
 
 
 # --- text to numbers ----------------------------------------------------------------------------------------
 
 
-def _layout(path: Path, what: str) -> _Layout:
-    number, first = next((each for lines in _lines(path) for each in lines.items()), (0, ""))
+def _points_of(path: Path, what: str) -> tuple[Callable[[], Iterator[Points]], bool]:
+    """Returns (what yields the points of a text, float64 (lines, 3), some at a time; whether x and y are longitude
+    and latitude). Empty fields are NaN."""
+    number, first = next(_lines(path), (0, ""))
     if not first:
         raise TerrainError(f"{what} holds no numbers")
-    delimiter = next((each for each in ";\t," if each in first), None)
-    words = [word.strip(" \"'").lower() for word in first.split(delimiter)]
+    mark = next((each for each in ";\t," if each in first), None)
+    words = [word.strip(" \"'").lower() for word in first.split(mark)]
+    header, columns, is_degrees = 0, (0, 1, 2), False
     try:
         np.array([word or "nan" for word in words], np.float64)
     except ValueError:
         x, y, z = (next((words.index(name) for name in names if name in words), None) for names in (_X, _Y, _Z))
         if x is None or y is None or z is None:
             raise TerrainError(f"{what}, line {number}: {first[:60]!r} names no x, y, z or lon, lat, z") from None
-        degrees = words[x] in _DEGREES and words[y] in _DEGREES
-        return _Layout(path, what, delimiter, number, (x, y, z), degrees)
-    if len(words) < 3 or (path.suffix.lower() != ".xyz" and words[3:] not in ([], [""])):
-        raise TerrainError(f"{what}: its first line has {len(words)} numbers; expected x, y and z")
-    return _Layout(path, what, delimiter)
-
-
-def _lines(path: Path) -> Iterator[dict[int, str]]:
-    """Number -> line of those that are neither empty nor a comment, some at a time."""
-    stripped = ((n, line.strip(" ")) for n, line in enumerate(read_lines(path, _KIND, _LONGEST), 1))
-    kept = ((n, line) for n, line in stripped if line and not line.startswith("#"))
-    while lines := dict(itertools.islice(kept, _LINES)):
-        yield lines
-
-
-def _numbers(layout: _Layout) -> Iterator[Points]:
-    """float64 (lines, columns) of the text, piece by piece; empty fields are NaN."""
-    mark = layout.delimiter
+        header, columns, is_degrees = number, (x, y, z), {words[x], words[y]} <= {*_DEGREES}
+    else:
+        if len(words) < 3 or (path.suffix.lower() != ".xyz" and words[3:] not in ([], [""])):
+            raise TerrainError(f"{what}: its first line has {len(words)} numbers; expected x, y and z")
     empty = None if mark is None else re.compile(f"(?:(?<={mark})|^) *(?={mark}|$)")
 
     def numbers_of(lines: Iterable[str]) -> Points:
         filled = lines if empty is None else [empty.sub("nan", line) for line in lines]
-        return np.loadtxt(filled, np.float64, delimiter=mark, usecols=layout.columns, ndmin=2, comments=None)
+        return np.loadtxt(filled, np.float64, delimiter=mark, usecols=columns, ndmin=2, comments=None)
 
-    for lines in _lines(layout.path):
-        lines.pop(layout.header, None)
-        if not lines:
-            continue
-        try:
-            yield numbers_of(lines.values())
-        except _NO_NUMBERS as error:
-            for number, line in lines.items():
-                try:
-                    numbers_of([line])
-                except _NO_NUMBERS as fault:
-                    why = re.split(r" at row|: row", str(fault))[0][:120]
-                    raise TerrainError(f"{layout.what}, line {number}: {why}; expected x, y and z") from error
-            raise
+    def points() -> Iterator[Points]:
+        kept = (each for each in _lines(path) if each[0] != header)
+        while lines := dict(itertools.islice(kept, _LINES)):
+            try:
+                yield numbers_of(lines.values())
+            except _NO_NUMBERS as error:
+                for number, line in lines.items():
+                    try:
+                        numbers_of([line])
+                    except _NO_NUMBERS as fault:
+                        why = re.split(r" at row|: row", str(fault))[0][:120]
+                        raise TerrainError(f"{what}, line {number}: {why}; expected x, y and z") from error
+                raise
+
+    return points, is_degrees
+
+
+def _lines(path: Path) -> Iterator[tuple[int, str]]:
+    """(number, line) of those that are neither empty nor a comment."""
+    stripped = ((n, line.strip(" ")) for n, line in enumerate(read_lines(path, _KIND, _LONGEST), 1))
+    return ((n, line) for n, line in stripped if line and not line.startswith("#"))
 
 
 # --- points -------------------------------------------------------------------------------------------------

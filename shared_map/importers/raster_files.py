@@ -12,6 +12,7 @@ import glob
 import itertools
 import lzma
 import math
+import os
 import re
 import tomllib
 import warnings
@@ -94,9 +95,9 @@ class Numbers(NamedTuple):
 
 def is_raster(path: Path) -> bool:
     """Returns True if a file begins or is named as a raster that is read."""
-    if path.suffix.lower() in PLAIN:
-        return path.is_file()
     with contextlib.suppress(OSError, TerrainError):
+        if path.suffix.lower() in PLAIN:
+            return path.is_file()
         head, member, _ = beginning(path, tuple(_ZIPPED), FileKind.IMAGE, "")
         return bool(_driver(head, Path(member or path), ""))
     return False
@@ -145,6 +146,8 @@ def _georeferenced(path: Path, what: str, files: contextlib.ExitStack) -> Any:
     import rasterio
     from rasterio.vrt import WarpedVRT
 
+    from shared_map.importers.georeference import system_named
+
     what = f"{what} {path}"
     if (suffix := path.suffix.lower()) in PLAIN:
         from shared_map.importers.plain_grids import read_npz, read_text_grid
@@ -160,7 +163,9 @@ def _georeferenced(path: Path, what: str, files: contextlib.ExitStack) -> Any:
         if not dataset.transform.a > 0 > dataset.transform.e:  # GDAL would mirror the ground
             cell = f"{dataset.transform.a:g} x {-dataset.transform.e:g}"
             raise TerrainError(f"{what}: its header gives a cell {cell}, expected a size above 0")
-        crs = dataset.crs or _system_beside(path, what)
+        crs, beside = dataset.crs, path.with_suffix(".prj")
+        if not crs and beside.is_file():  # which GDAL reads beside some formats only
+            crs = system_named(read_text(beside, FileKind.SYSTEM), f"{what}: {beside}")
         text = Numbers(_text_numbers(dataset, path, what), dataset.transform, crs, (f"a grid as text, {driver}",))
         return in_memory(text, files)
     if dataset.transform.is_identity and dataset.gcps[0]:
@@ -176,14 +181,6 @@ def _check_numbers(dataset: Any, what: str) -> None:
     if 0 in dataset.scales or not np.isfinite([*dataset.scales, *dataset.offsets]).all():
         found = f"scales {dataset.scales[:4]} and offsets {dataset.offsets[:4]}"
         raise TerrainError(f"{what} has {found}, expected finite numbers, and no scale of 0")
-
-
-def _system_beside(path: Path, what: str) -> Any:
-    """The system of a .prj, which GDAL reads beside some formats only."""
-    from shared_map.importers.georeference import system_named
-
-    found = path.with_suffix(".prj")
-    return system_named(read_text(found, FileKind.SYSTEM), f"{what}: {found}") if found.is_file() else None
 
 
 def in_memory(given: Numbers, files: contextlib.ExitStack) -> Any:
@@ -359,7 +356,7 @@ def _driver(head: bytes, path: Path, what: str) -> str:
     text = head.removeprefix(codecs.BOM_UTF8).lstrip().lower()
     begun = (driver for magic, driver in _DRIVERS.items() if head.startswith(magic) or text.startswith(magic))
     headers = path.with_suffix(".hdr"), Path(f"{path}.hdr")
-    beside = (beginning(each, (), FileKind.IMAGE, what)[0] for each in headers if each.is_file())
+    beside = (beginning(each, (), FileKind.IMAGE, what)[0] for each in headers if os.path.isfile(each))
     envi = ("ENVI" for header in beside if header.startswith(b"ENVI"))
     if found := next(itertools.chain(begun, envi), _NAMELESS.get(path.suffix.lower())):
         return found

@@ -238,61 +238,48 @@ def _recovered(heights_m: Floats, by: _Resampling) -> Floats:
     At the border of its file a filter has fewer cells to weigh.
     """
     outer = round(_REACH / by.step)
-    at = np.rint(by.at(len(heights_m))[[0, -1]]).astype(np.intp)
-    sums = _Sums(len(heights_m) - 2 * outer, by.moved(outer))
-    inner = slice(at[0] + _REACH - sums.first, at[1] + 1 - _REACH - sums.first)
+    ends = np.rint(by.at(len(heights_m))[[0, -1]]).astype(np.intp)
+    by = by.moved(outer)
+    first = int(np.floor(by.at(1)[0])) + 1 - _REACH
+    inner = slice(ends[0] + _REACH - first, ends[1] + 1 - _REACH - first)
     middle_m = np.float64(heights_m.mean())
     parts = [heights_m[outer:-outer, n : n + _AT_ONCE] for n in range(0, heights_m.shape[1], _AT_ONCE)]
-    return np.hstack([(sums.solved(part - middle_m)[inner] + middle_m).astype(np.float32) for part in parts])
+    return np.hstack([(_solved(part - middle_m, by)[0][inner] + middle_m).astype(np.float32) for part in parts])
 
 
-class _Sums:
-    """The weighted sums which a filter makes of the cells of a survey.
+def _solved(heights_m: _Doubles, by: _Resampling) -> tuple[_Doubles, _Doubles, NDArray[np.intp]]:
+    """Returns (the heights of the survey, (cells, lines), by least squares; weights and numbers of the surveyed
+    cells in each of the sums which the filter made of them). Number 0 is the first that has a weight."""
+    from scipy.linalg import solveh_banded
 
-    first  the number of the first surveyed cell that has a weight
-    """
-
-    def __init__(self, count: int, by: _Resampling) -> None:
-        at = by.at(count)
-        cell = np.floor(at).astype(np.intp)
-        near = cell[:, None] + np.arange(1 - _REACH, _REACH + 1)
-        weights = by.kernel(at[:, None] - near)
-        self._weights = weights / weights.sum(axis=1, keepdims=True)
-        self.first = int(near[0, 0])
-        self._near = near - self.first
-        self._starts = np.flatnonzero(np.diff(cell, prepend=cell[0] - 1))
-
-    def solved(self, heights_m: _Doubles) -> _Doubles:
-        """The heights of the survey, (cells, lines), by least squares."""
-        from scipy.linalg import solveh_banded
-
-        width, groups = 2 * _REACH, len(self._starts)
-        many = groups + width - 1
-        banded = np.zeros((width, many))
-        # Cells beyond the border, with hardly a weight, go on as the others do.
-        for one, other in ((0, 1), (0, 2), (1, 2)):
+    at = by.at(len(heights_m))
+    cell = np.floor(at).astype(np.intp)
+    near = cell[:, None] + np.arange(1 - _REACH, _REACH + 1)
+    weights = by.kernel(at[:, None] - near)
+    weights /= weights.sum(axis=1, keepdims=True)
+    starts = np.flatnonzero(np.diff(cell, prepend=cell[0] - 1))
+    width, groups = 2 * _REACH, len(starts)
+    many = groups + width - 1
+    banded = np.zeros((width, many))
+    # Cells beyond the border, with hardly a weight, go on as the others do.
+    for one in range(3):
+        for other in range(one, 3):
             banded[other - one, one : one + many - 2] += _SMOOTH * _BEND[one] * _BEND[other]
-        for one in range(3):
-            banded[0, one : one + many - 2] += _SMOOTH * _BEND[one] ** 2
-        right = np.zeros((many, heights_m.shape[1]))
-        for one in range(width):
-            weight = self._weights[:, one, None]
-            products = np.add.reduceat(weight * self._weights[:, one:], self._starts)
-            banded[: width - one, one : one + groups] += products.T
-            right[one : one + groups] += np.add.reduceat(weight * heights_m, self._starts)
-        solved: _Doubles = solveh_banded(banded, right, lower=True, check_finite=False)
-        return solved
-
-    def summed(self, survey_m: _Doubles) -> _Doubles:
-        """The heights which the filter makes of those of a survey."""
-        return np.asarray(sum(self._weights[:, n, None] * survey_m[self._near[:, n]] for n in range(2 * _REACH)))
+    right = np.zeros((many, heights_m.shape[1]))
+    for one in range(width):
+        weight = weights[:, one, None]
+        banded[: width - one, one : one + groups] += np.add.reduceat(weight * weights[:, one:], starts).T
+        right[one : one + groups] += np.add.reduceat(weight * heights_m, starts)
+    survey_m: _Doubles = solveh_banded(banded, right, lower=True, check_finite=False)
+    return survey_m, weights, near - near[0, 0]
 
 
 def _error(lines: _Doubles, by: _Resampling) -> float:
     """Mean difference of lines from what a filter makes of the survey that fits best."""
     if not 2 * _REACH / len(lines) < by.step < 1:
         return math.inf
-    sums = _Sums(len(lines), by)
     lines = lines - lines.mean(axis=0)
+    survey_m, weights, near = _solved(lines, by)
+    summed_m = sum(weights[:, n, None] * survey_m[near[:, n]] for n in range(2 * _REACH))
     edge = int(_REACH / by.step)
-    return float(np.abs(lines - sums.summed(sums.solved(lines)))[edge:-edge].mean())
+    return float(np.abs(lines - summed_m)[edge:-edge].mean())

@@ -80,7 +80,11 @@ def load_source(config: TerrainConfig, seed: int, progress: Progress = no_progre
     elif config.source == "jacksboro":
         source = _jacksboro(config, seed)
     else:
-        source = _from_file(Path(config.source), config, progress)
+        from shared_map.importers.height_rasters import read_raster
+
+        path = Path(config.source)
+        check_file(path, FileKind.TEXT_GRID)
+        source = _map(path, config) if path.suffix.lower() in _LEVEL else read_raster(path, config, progress)
     source = without_voids(source, config)
     if config.photo is not None:
         from shared_map.importers.cover.photos import read_photo
@@ -133,15 +137,6 @@ def _jacksboro_path() -> Path:
 
 
 # --- files --------------------------------------------------------------------------------------------------
-
-
-def _from_file(path: Path, config: TerrainConfig, progress: Progress) -> Source:
-    check_file(path, FileKind.TEXT_GRID)
-    if path.suffix.lower() in _LEVEL:
-        return _map(path, config)
-    from shared_map.importers.height_rasters import read_raster
-
-    return read_raster(path, config, progress)
 
 
 def _map(path: Path, config: TerrainConfig) -> Source:

@@ -9,8 +9,7 @@ runs that touch are one patch: a sea is some thousand runs, and a steep slope ha
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -18,14 +17,12 @@ from numpy.typing import NDArray
 
 from shared_map.array_files import Bools, Floats
 from shared_map.importers.survey_cells import surveyed
-from shared_map.terrain.row_bands import bands
 from swarm.config.ground import TerrainConfig
 
 _LEAST_ALIKE, _LEAST_ALIKE_MEANS = 2, 3
 """Number of the eight neighbours that are as high as a cell of a patch: those of a creek one cell wide are two.
 Among means of blocks a chain of equal ones is a contour line."""
 _STEPS = ((0, 1), (1, -1), (1, 0), (1, 1))
-_COUNTS = ("edge", "differ", "beside", "below", "lower", "terrace", "steep")
 _SHORE_CELLS, _UNDER, _OVER, _RIPPLED = 3, 0.25, 0.015, 0.1
 """Foot of a shore that a filter leaves on its water: cells within this distance, higher than it by less than this
 share of the rise there, or lower by less than a quarter, if a tenth of the cells beside a patch is so. Unfiltered
@@ -41,44 +38,22 @@ Counts = NDArray[np.int64]
 
 @dataclass(frozen=True, eq=False)
 class Patches:
-    """Patches of equal height, and what lies beside them.
+    """Patches of equal height.
 
     labels    int32 (rows, cols), 1 .. count; 0 is no patch
     height_m  float32 (count + 1,), of the first cell of each; NaN of number 0
     spread_m  float32 (count + 1,), of an even slope whose heights vary as much: the lowest and the highest
               of many cells tell of their number
     cells     int64 (count + 1,)
-    edge      int64 (count + 1,): sides of its cells beyond which another cell lies
-    differ    of these, those with another height beyond: the visible part of its shore
-    beside    of these, those with another patch beyond that is at least a quarter as large
-    below     of these, those with such a patch beyond that is lower
-    lower     of `differ`, those with a lower height beyond that is no such patch
-    terrace   of `beside`, those with a patch beyond that is one rounding away
-    steep     of `differ`, those with a height beyond that is more than one rounding away
-    border    bool (count + 1,): whether it reaches the border of the model
     """
 
     labels: Labels
     height_m: Floats
     spread_m: Floats
     cells: Counts
-    edge: Counts
-    differ: Counts
-    beside: Counts
-    below: Counts
-    lower: Counts
-    terrace: Counts
-    steep: Counts
-    border: NDArray[np.bool_]
 
 
-def level_patches(
-    elevation_m: Floats,
-    same_m: float,
-    least_cells: int,
-    step_m: float,
-    shore_m: Floats | None = None,
-) -> Patches:
+def level_patches(elevation_m: Floats, same_m: float, least_cells: int, *, means: bool = False) -> Patches:
     """The patches of a height model.
 
     Parameters
@@ -89,18 +64,12 @@ def level_patches(
         Neighbours that differ by no more are equally high.
     least_cells : int
         Smaller patches are none.
-    step_m : float
-        What heights are rounded to; 0 if they are not.
-    shore_m : float32 (rows, cols), m, optional
-        Heights also of cells that can be no part of a patch and are NaN in `elevation_m`. They are means, so that
-        no filter has left ripples at shores.
+    means : bool
+        Whether heights are means of blocks, in which no filter has left ripples at shores.
     """
-    means = shore_m is not None
-    labels, cells = labelled(
-        elevation_m, np.float32(same_m), least_cells, _LEAST_ALIKE_MEANS if means else _LEAST_ALIKE
-    )
+    least_alike = _LEAST_ALIKE_MEANS if means else _LEAST_ALIKE
+    labels, cells = labelled(elevation_m, np.float32(same_m), least_cells, least_alike)
     many = len(cells)
-
     first = np.full(many, np.nan, np.float32)
     at = np.flatnonzero(labels)[::-1]  # backwards: the value of a patch's first cell is written last
     first[labels.reshape(-1)[at]] = elevation_m.reshape(-1)[at]
@@ -109,53 +78,11 @@ def level_patches(
     total_m, total_m2 = np.bincount(of_cell, above_m, many), np.bincount(of_cell, above_m**2, many)
     variance = total_m2 / np.maximum(cells, 1) - (total_m / np.maximum(cells, 1)) ** 2
     spread_m = np.sqrt(12 * np.maximum(variance, 0)).astype(np.float32)
-    if shore_m is None:
-        shore_m = elevation_m
+    if not means:
         _grow(elevation_m, labels, first)
         cells = np.bincount(labels.reshape(-1), minlength=many)
         cells[0] = 0
-    border = np.zeros(many, np.bool_)
-    for line in (labels[0], labels[-1], labels[:, 0], labels[:, -1]):
-        border[line] = True
-    border[0] = False
-    sides = _sides(shore_m, labels, cells, same_m, step_m)
-    return Patches(labels, first, spread_m, cells, border=border, **sides)
-
-
-def _sides(
-    elevation_m: Floats,
-    labels: Labels,
-    cells: Counts,
-    same_m: float,
-    step_m: float,
-) -> dict[str, Counts]:
-    """The counts of `Patches`, `edge` and what follows it: what lies beyond the sides of each patch's cells."""
-    height, width = elevation_m.shape
-    total = {name: np.zeros(len(cells), np.int64) for name in _COUNTS}
-    for down, right in ((-1, 0), (1, 0), (0, -1), (0, 1)):
-        here = np.s_[max(-down, 0) : height - max(down, 0), max(-right, 0) : width - max(right, 0)]
-        there = np.s_[max(down, 0) : height + min(down, 0), max(right, 0) : width + min(right, 0)]
-        at = (labels[here] > 0) & (labels[there] != labels[here])
-        patch, beyond = labels[here][at], labels[there][at]
-        height_m = elevation_m[here][at]
-        above_m = elevation_m[there][at] - height_m
-        with np.errstate(invalid="ignore"):
-            differs = np.abs(above_m) > 2 * same_m
-            near = np.abs(above_m) <= 1.5 * step_m
-            low = differs & (above_m < 0)
-        beside = differs & (beyond > 0) & (4 * cells[beyond] >= cells[patch])
-        kinds = {
-            "edge": np.ones_like(low),
-            "differ": differs,
-            "beside": beside,
-            "below": beside & low,
-            "lower": low & ~beside,
-            "terrace": beside & near,
-            "steep": differs & ~near,
-        }
-        for name, there in kinds.items():
-            total[name] += np.bincount(patch[there], minlength=len(cells))
-    return total
+    return Patches(labels, first, spread_m, cells)
 
 
 def _grow(elevation_m: Floats, labels: Labels, height_m: Floats) -> None:
@@ -298,7 +225,7 @@ def level_ground(elevation_m: Floats) -> LevelGround:
     if finer > 1:
         mask, level = mask[np.ix_(row, col)], level[np.ix_(row, col)]
         # No level patch of the file itself becomes ground in silence, even if the survey is estimated wrongly.
-        own = level_patches(elevation_m, _SAME_M, _LEAST_CELLS_COARSE, 0.0)
+        own = level_patches(elevation_m, _SAME_M, _LEAST_CELLS_COARSE)
         missed = own.cells - np.bincount(own.labels[mask], minlength=own.cells.size)
         large = (own.cells > _TOLD_SHARE * elevation_m.size) & (2 * missed > own.cells)
         large[0] = False
@@ -315,7 +242,7 @@ def _at_one_scale(elevation_m: Floats) -> tuple[Bools, list[tuple[float, int]], 
     if rounded_m > step_m:
         step_m = rounded_m
         found = _level_with(elevation_m, step_m)
-    water, unsure = _judged(found, _STILL_M)
+    water, unsure = _judged(found, elevation_m, _SAME_M, _STILL_M, step_m)
     mask: Bools = water[found.labels]
     large = unsure | (found.cells > _TOLD_SHARE * elevation_m.size)
     large[0] = False
@@ -327,8 +254,7 @@ def _at_one_scale(elevation_m: Floats) -> tuple[Bools, list[tuple[float, int]], 
 
 def _level_with(elevation_m: Floats, step_m: float) -> Patches:
     """The level patches of heights that are rounded to `step_m`."""
-    least = _LEAST_CELLS_COARSE if step_m >= _COARSE_M else _LEAST_CELLS_FINE
-    return level_patches(elevation_m, _SAME_M, least, step_m)
+    return level_patches(elevation_m, _SAME_M, _LEAST_CELLS_COARSE if step_m >= _COARSE_M else _LEAST_CELLS_FINE)
 
 
 def _rounded_m(found: Patches) -> float:
@@ -343,20 +269,45 @@ def _rounded_m(found: Patches) -> float:
     return 0.0
 
 
-def _judged(found: Patches, still_m: float) -> tuple[Bools, Bools]:
-    """Returns for each patch: (whether it is water, whether that cannot be known)."""
+def _judged(
+    found: Patches, elevation_m: Floats, same_m: float, still_m: float, step_m: float
+) -> tuple[Bools, Bools]:
+    """Returns for each patch: (whether it is water, whether that cannot be known), by what lies beyond its sides.
+
+    elevation_m  heights also of cells that are no part of a patch
+    same_m       patches are of neighbours that differ by no more
+    step_m       what heights are rounded to; 0 if they are not
+    """
+    labels, cells = found.labels, found.cells
+    rows, cols = labels.shape
+    sides = np.zeros((7, len(cells)), np.int64)
+    for down, right in ((-1, 0), (1, 0), (0, -1), (0, 1)):
+        here = np.s_[max(-down, 0) : rows - max(down, 0), max(-right, 0) : cols - max(right, 0)]
+        there = np.s_[max(down, 0) : rows + min(down, 0), max(right, 0) : cols + min(right, 0)]
+        at = (labels[here] > 0) & (labels[there] != labels[here])
+        patch, beyond = labels[here][at], labels[there][at]
+        above_m = elevation_m[there][at] - elevation_m[here][at]
+        with np.errstate(invalid="ignore"):
+            differs = np.abs(above_m) > 2 * same_m
+            near = np.abs(above_m) <= 1.5 * step_m
+            low = differs & (above_m < 0)
+        level = differs & (beyond > 0) & (4 * cells[beyond] >= cells[patch])
+        kinds = (np.ones_like(low), differs, low & ~level, differs & ~near, level, level & low, level & near)
+        sides += [np.bincount(patch[kind], minlength=len(cells)) for kind in kinds]
+    # Sides beyond which another cell lies; of these, those with another height beyond, the visible part of its
+    # shore; of which lower, and no patch; of which more than one rounding away. Of the shore, those with another
+    # patch beyond that is at least a quarter as large; of which lower; of which one rounding away.
+    edge, differ, lower, steep, beside, below, terrace = sides
+    border = np.isin(np.arange(len(cells)), np.concatenate((labels[[0, -1]].ravel(), labels[:, [0, -1]].ravel())))
     still = found.spread_m <= np.float32(still_m)
     # Without any shore to see, it is a floor, or a part of a slope.
-    shore = (found.differ > _LEAST_SHORE * found.edge) & (found.lower <= _MOST_LOWER * found.differ)
-    outlet = found.lower + found.below <= _MOST_LOWER * found.differ
-    stair = found.beside > _MOST_BESIDE * found.differ
-    level = still & shore & (outlet | ~stair)
-    level[0] = False
-    sea = found.border & (np.abs(found.height_m) <= _SEA_M)
-    plain = found.terrace > _MOST_TERRACES * found.differ
-    plain |= found.steep <= _LEAST_STEEP * found.differ
-    unsure = level & ~sea & plain
-    return level & ~unsure, unsure
+    shore = (differ > _LEAST_SHORE * edge) & (lower <= _MOST_LOWER * differ)
+    outlet = lower + below <= _MOST_LOWER * differ
+    water = still & shore & (outlet | (beside <= _MOST_BESIDE * differ))
+    water[0] = False
+    sea = border & (np.abs(found.height_m) <= _SEA_M)
+    unsure = water & ~sea & ((terrace > _MOST_TERRACES * differ) | (steep <= _LEAST_STEEP * differ))
+    return water & ~unsure, unsure
 
 
 def _rough_water(elevation_m: Floats, mask: Bools) -> list[tuple[float, int]]:
@@ -374,8 +325,9 @@ def _rough_water(elevation_m: Floats, mask: Bools) -> list[tuple[float, int]]:
     with np.errstate(invalid="ignore"):
         smooth = range_m <= np.float32(_ROUGH_M)
     # A rough block can be a shore, but no part of a patch.
-    found = level_patches(np.where(smooth, mean_m, np.float32(np.nan)), _BLOCK_SAME_M, _LEAST_BLOCKS, 0.0, mean_m)
-    water, _ = _judged(found, _BLOCK_STILL_M)
+    flat_m = np.where(smooth, mean_m, np.float32(np.nan))
+    found = level_patches(flat_m, _BLOCK_SAME_M, _LEAST_BLOCKS, means=True)
+    water, _ = _judged(found, mean_m, _BLOCK_SAME_M, _BLOCK_STILL_M, 0.0)
     row, col = np.nonzero(smooth)
     cells = blocks[row, :, col, :]
     steps_m = sum(np.abs(np.diff(cells, axis=axis)).mean(axis=(1, 2)) for axis in (1, 2))
@@ -415,28 +367,16 @@ def looked_at(
     Parameters
     ----------
     stored : float32 (rows, cols)
-        As in the file; `scale` and `offset` make metres of it. In a large one only a sample is examined for flat
-        areas.
+        As in the file; `scale` and `offset` make metres of it.
     """
     unknown = undeclared_voids(without(stored, config.nodata_values), scale, offset)
     voids = (*config.nodata_values, *unknown)
-    rows, cols = stored.shape
-    every = math.ceil(math.sqrt(max(stored.size / MOST_SAMPLED, 1.0)))
-    some_m = without(stored[::every, ::every], voids) * np.float32(scale) + np.float32(offset)
-    found = level_ground(some_m)
-    level = found.mask.repeat(every, axis=0)[:rows].repeat(every, axis=1)[:, :cols]
-    return voids, level, [*_said_of_voids(unknown), *_said_of_level(found, config)]
-
-
-def _said_of_voids(voids: Sequence[float]) -> Iterator[str]:
-    for code in voids:
-        yield (
-            f"{code:g} is taken for no height: nothing else is near it, though the file does not declare it"
-            " (terrain.nodata_values says so for good)"
-        )
-
-
-def _said_of_level(found: LevelGround, config: TerrainConfig) -> Iterator[str]:
+    notes = [
+        f"{code:g} is taken for no height: nothing else is near it, though the file does not declare it"
+        " (terrain.nodata_values says so for good)"
+        for code in unknown
+    ]
+    found = level_ground(without(stored, voids) * np.float32(scale) + np.float32(offset))
     if found.patches:
         (height_m, cells), many = found.patches[0], len(found.patches)
         taken = f"is taken for {config.level_is}, as terrain.level_is says"
@@ -445,15 +385,16 @@ def _said_of_level(found: LevelGround, config: TerrainConfig) -> Iterator[str]:
         # Filled sinks are many small lakes; they close much of a map.
         share = float(found.mask.mean())
         filled = share > _MUCH_WATER and 4 * cells < share * found.mask.size and config.level_is == "water"
-        yield (
+        notes.append(
             f"{'! ' * filled}level ground: {share:.1%} of the file in {many} patch{'es' * (many > 1)},"
             f" the largest {cells} cells at {height_m:g} m, {taken}"
         )
     if found.uncertain > _TOLD_SHARE and config.level_is == "water":
-        yield (
+        notes.append(
             f"! level ground: {found.uncertain:.1%} of the file is dead level, too, and taken for ground, as its"
             " shore is not that of water or its heights are rounded; of water say terrain.water_below_m"
         )
+    return voids, found.mask, notes
 
 
 def _step_m(elevation_m: Floats) -> float:
@@ -500,24 +441,17 @@ def undeclared_voids(
     codes = sorted(code for code in _GAPS_M if (heights == code).any())
     if not codes:
         return ()
-    nearest = dict.fromkeys(codes, np.inf)
-    occupied = np.zeros(int(2 * HIGHEST_M / _BIN_M) + 1, np.bool_)
-    for row0, row1 in bands(heights.shape[0]):
-        band = heights[row0:row1]
-        rest = band[np.isfinite(band) & ~np.isin(band, np.array(codes, band.dtype))].astype(np.float64)
-        rest_m = rest * scale + offset
-        there = np.abs(rest_m) <= HIGHEST_M  # what lies beyond is a void anyway
-        if not there.any():
-            continue
-        occupied[((rest_m[there] + HIGHEST_M) / _BIN_M).astype(np.intp)] = True
-        for code in codes:
-            nearest[code] = min(nearest[code], float(np.abs(rest[there] - code).min()) * abs(scale))
-    at = np.flatnonzero(occupied)
-    if at.size == 0:
+    rest = heights[np.isfinite(heights) & ~np.isin(heights, np.array(codes, heights.dtype))].astype(np.float64)
+    rest_m = rest * scale + offset
+    there = np.abs(rest_m) <= HIGHEST_M  # what lies beyond is a void anyway
+    if not there.any():
         # Nothing but the sea is a map; nothing but -9999 is none.
         return tuple(code for code in codes if code != 0)
-    widest = float(np.diff(at).max(initial=0)) * _BIN_M
-    return tuple(code for code in codes if nearest[code] >= _GAPS_M[code] and nearest[code] > _ALONE * widest)
+    occupied = np.zeros(int(2 * HIGHEST_M / _BIN_M) + 1, np.bool_)
+    occupied[((rest_m[there] + HIGHEST_M) / _BIN_M).astype(np.intp)] = True
+    widest_m = float(np.diff(np.flatnonzero(occupied)).max(initial=0)) * _BIN_M
+    nearest_m = {code: float(np.abs(rest[there] - code).min()) * abs(scale) for code in codes}
+    return tuple(code for code in codes if nearest_m[code] >= _GAPS_M[code] and nearest_m[code] > _ALONE * widest_m)
 
 
 def without(heights: Floats, voids: Sequence[float]) -> Floats:

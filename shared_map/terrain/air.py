@@ -141,6 +141,11 @@ def air_terrain(common: Terrain, air: AirConfig, wind: WindConfig, named: str) -
     digest = hashlib.blake2b(digest_size=8)
     digest.update(common.digest.encode() + msgspec.json.encode([air, wind], order="sorted"))
     digest.update(np.ascontiguousarray(flown.height_m).data)
+    blows: tuple[str, ...] = ()
+    if wind.speed_m_per_s:
+        low, high = air.speed_m_per_s - wind.speed_m_per_s, air.speed_m_per_s + wind.speed_m_per_s
+        where = f"in a wind of {wind.speed_m_per_s:g} m/s from {wind.from_deg:g} degrees"
+        blows = (f"{where}: {low:.3g} m/s over the ground against it, {high:.3g} m/s with it",)
     over = f"flies at {np.nanmin(flown.height_m):,.0f} to {np.nanmax(flown.height_m):,.0f} m"
     return replace(
         common,
@@ -151,15 +156,6 @@ def air_terrain(common: Terrain, air: AirConfig, wind: WindConfig, named: str) -
         climb=flown.climb,
         least_s_per_m=1 / air.speed_m_per_s,
         flight_m=flown.height_m,
-        notes=(f"{over}, no steeper than {flown.grade:.3g}", flown.climb.note, *_said_of(wind, air)),
+        notes=(f"{over}, no steeper than {flown.grade:.3g}", flown.climb.note, *blows),
         zones=(),
     )
-
-
-def _said_of(wind: WindConfig, air: AirConfig) -> tuple[str, ...]:
-    """Returns the sentence about the wind; empty if there is none."""
-    if not wind.speed_m_per_s:
-        return ()
-    low, high = air.speed_m_per_s - wind.speed_m_per_s, air.speed_m_per_s + wind.speed_m_per_s
-    blows = f"in a wind of {wind.speed_m_per_s:g} m/s from {wind.from_deg:g} degrees"
-    return (f"{blows}: {low:.3g} m/s over the ground against it, {high:.3g} m/s with it",)

@@ -40,16 +40,8 @@ class Level:
 
 def level_of(terrain: Terrain, most_cells: int) -> Level:
     """Returns the finest level that has at most this number of cells."""
-    lethal = np.isinf(terrain.pace_s_per_m)
-    level = Level(
-        1,
-        terrain.grid,
-        terrain.elevation_m,
-        terrain.photo,
-        terrain.classes,
-        terrain.pace_s_per_m,
-        lethal.astype(np.float32),
-    )
+    colours, pace = (terrain.photo, terrain.classes), terrain.pace_s_per_m
+    level = Level(1, terrain.grid, terrain.elevation_m, *colours, pace, np.isinf(pace).astype(np.float32))
     while level.grid.cells > most_cells:
         level = _coarser(level)
     return level

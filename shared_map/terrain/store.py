@@ -61,7 +61,7 @@ def scenario_key(scenario: Scenario) -> str:
     names = (named.source, named.photo, named.labels, named.cover, named.cover_codes)
     files = [Path(name) for name in names if name]
     files += [path for zone in (*scenario.cost.zones, *named.hidden.zones) for path in files_of_zone(zone)]
-    stamps = [[path.stat().st_size, path.stat().st_mtime_ns] for path in files if path.is_file()]
+    stamps = [[path.stat().st_size, path.stat().st_mtime_ns] for path in files if os.path.isfile(path)]
     layers = [source_of(named, scenario.plugin_folder) for named in cost_layers_of(scenario)]
     payload = msgspec.json.encode([parts, stamps, layers], order="sorted")
     return hashlib.blake2b(payload, digest_size=8).hexdigest()
@@ -204,11 +204,11 @@ def find_prepared(digest: str, folder: Path | None, runs: Path) -> Terrain | Non
     return None
 
 
-def load_beside(folder: Path, name: str, key: str = "") -> NDArray[Any] | None:
+def load_beside(folder: Path | None, name: str, key: str = "") -> NDArray[Any] | None:
     """The "truth", or "homes" (`homes_of` terrain and truth), that `save_prepared` left beside a terrain, mapped
-    read-only; None if it is not there."""
-    meta = read_meta(folder / _META, key)
-    if meta is None or name not in meta.arrays:
+    read-only; None if it is not there, or there is no folder."""
+    meta = None if folder is None else read_meta(folder / _META, key)
+    if folder is None or meta is None or name not in meta.arrays:
         return None
     return read_array(folder, name, meta.grid.shape, np.bool_ if name == "homes" else np.float32)
 
@@ -253,18 +253,14 @@ def load_terrain(setup: RoleSetup) -> Terrain:
 
 def load_truth(setup: RoleSetup, terrain: Terrain) -> Floats:
     """The truth of a run, as `load_terrain`. The caller must not write to it."""
-    found = _beside(setup, "truth")
+    found = load_beside(setup.run_dir, "truth", scenario_key(setup.scenario))
     return build_truth(setup.scenario, terrain) if found is None else found
 
 
 def load_homes(setup: RoleSetup, terrain: Terrain, truth: Floats) -> Bools:
     """`homes_of` the terrain and truth of a run, as `load_terrain`. The caller must not write to it."""
-    found = _beside(setup, "homes")
+    found = load_beside(setup.run_dir, "homes", scenario_key(setup.scenario))
     return homes_of(terrain.pace_s_per_m, truth) if found is None else found
-
-
-def _beside(setup: RoleSetup, name: str) -> NDArray[Any] | None:
-    return None if setup.run_dir is None else load_beside(setup.run_dir, name, scenario_key(setup.scenario))
 
 
 def homes_of(prior: Floats, truth: Floats) -> Bools:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, assert_never
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,8 +23,7 @@ from swarm.wire.messages.map_data import PACE_LEAST, PACE_MOST
 if TYPE_CHECKING:
     from shared_map.importers.zones.zone_files import FileFacts
 
-PREFERRED_FACTOR = np.float32(0.5)
-ROUGH_FACTOR = np.float32(2.0)
+_FACTORS = {"preferred": np.float32(0.5), "rough": np.float32(2.0)}
 _BESIDE = (".shx", ".dbf", ".prj", ".cpg")
 """Files that belong to a Shapefile."""
 _APPROACH_CELLS = 3
@@ -59,15 +58,12 @@ class ZoneFacts:
             text += f", {self.lethal / cells:.1%} of the terrain made lethal"
         if self.opened:
             text += f", {self.opened} opened"
-        if self.file is None:
+        if (file := self.file) is None:
             return f"{shape}: {text}"
-        file = self.file
         layer = f" layer {file.layer!r}" if file.layer and file.layer != Path(file.file).stem else ""
-        parts = [f"{shape} from {file.file}{layer} in {file.crs}: {file.used} of {file.features}"]
-        parts[0] += " features" if file.layer else " values"
-        if file.bridges:
-            parts[0] += f" ({file.bridges} bridge{'s' * (file.bridges > 1)})"
-        parts.append(text)
+        used = f"{file.used} of {file.features} {'features' if file.layer else 'values'}"
+        bridges = f" ({file.bridges} bridge{'s' * (file.bridges > 1)})" if file.bridges else ""
+        parts = [f"{shape} from {file.file}{layer} in {file.crs}: {used}{bridges}", text]
         left_out = [f"{file.outside} outside of the terrain"] if file.outside else []
         for why, count in file.skipped.most_common(6):
             names = file.named.get(why, [])
@@ -83,14 +79,8 @@ class ZoneFacts:
 
     def as_json(self, cells: int) -> dict[str, Any]:
         """Fields of `--json`; shares are of all cells."""
-        facts: dict[str, Any] = {
-            "name": self.name,
-            "kind": self.kind,
-            "cells": self.cells,
-            "changed": self.changed,
-            "opened": self.opened,
-            "lethal_share": round(self.lethal / cells, 6),
-        }
+        facts = {key: getattr(self, key) for key in ("name", "kind", "cells", "changed", "opened")}
+        facts["lethal_share"] = round(self.lethal / cells, 6)
         if self.file is not None:
             named = {"named": "skipped_ids", "mended": "mended_ids"}
             facts |= {named.get(name, name): value for name, value in vars(self.file).items()}
@@ -118,12 +108,9 @@ def paint_zones(
     for n, zone in enumerate(zones):
         painted.append(painter.read(zone, f"{key}[{n}]: zone"))
         painter.cost(painted[-1])
-    for each in painted:
-        painter.water(each)
-    for each in painted:
-        painter.bridges(each)
-    for each in painted:
-        painter.forbidden(each)
+    for step in (painter.water, painter.bridges, painter.forbidden):
+        for each in painted:
+            step(each)
     return [each.facts for each in painted]
 
 
@@ -148,12 +135,6 @@ class _Painted:
     bridges: Part = _NOTHING
 
 
-def _around(inside: Bools) -> Window:
-    """The smallest window that holds all cells of a mask; there is one."""
-    rows, cols = np.flatnonzero(inside.any(axis=1)), np.flatnonzero(inside.any(axis=0))
-    return Window(int(rows[0]), int(cols[0]), int(rows[-1]) + 1, int(cols[-1]) + 1)
-
-
 def _part(window: Window) -> tuple[slice, slice]:
     return slice(window.row0, window.row1), slice(window.col0, window.col1)
 
@@ -162,8 +143,7 @@ class _Painter:
     def __init__(
         self, pace: Floats, grid: GridSpec, cost: CostConfig, void: Bools | None, classes: Bytes | None
     ) -> None:
-        self._pace, self._grid, self._cost, self._classes = pace, grid, cost, classes
-        self._void = void
+        self._pace, self._grid, self._classes, self._void = pace, grid, classes, void
         self._road_pace = np.float32(1 / cost.road_speed_m_per_s)
         self._water: Bools | None = None
 
@@ -182,7 +162,8 @@ class _Painter:
             inside = ~inside
             if not inside.any():
                 return _Painted(zone, facts)
-        window = _around(inside)
+        rows, cols = np.flatnonzero(inside.any(axis=1)), np.flatnonzero(inside.any(axis=0))
+        window = Window(int(rows[0]), int(cols[0]), int(rows[-1]) + 1, int(cols[-1]) + 1)
         inside = inside[_part(window)].copy()
         facts.cells = int(inside.sum())
         if zone.kind in ("forbidden", "keep_in", "water"):
@@ -194,32 +175,18 @@ class _Painter:
         """Applies zones that only cost."""
         zone, (window, values) = painted.zone, painted.values
         if not window.empty:
-            self._set(painted.facts, window, self._changed(zone, window, values, from_file=zone.file is not None))
-        if painted.bridges[0].empty:
-            painted.values = _NOTHING
-
-    def _changed(self, zone: ZoneConfig, window: Window, values: Floats, *, from_file: bool) -> Floats:
-        """The pace of a window with a zone in it."""
-        before = self._pace[_part(window)]
-        inside = ~np.isnan(values)
-        after = before.copy()
-        match zone.kind:
-            case "preferred":
-                after[inside] *= PREFERRED_FACTOR
-            case "rough":
-                after[inside] *= ROUGH_FACTOR
-            case "factor" | "water":
-                after[inside] = self._possible(before[inside] * values[inside])
-            case "pace":
+            before = self._pace[_part(window)]
+            inside, after = ~np.isnan(values), before.copy()
+            if zone.kind == "road":
+                self._lay(window, after, values, inside, from_file=zone.file is not None)
+            elif zone.kind == "pace":
                 inside &= np.isfinite(before)
                 after[inside] = self._possible(values[inside])
-            case "road":
-                self._lay(window, after, values, inside, from_file)
-            case "forbidden" | "keep_in":
-                pass  # painted last
-            case _:
-                assert_never(zone.kind)
-        return after
+            else:
+                after[inside] = self._possible(before[inside] * _FACTORS.get(zone.kind, values[inside]))
+            self._set(painted.facts, window, after)
+        if painted.bridges[0].empty:
+            painted.values = _NOTHING
 
     def _lay(self, window: Window, after: Floats, values: Floats, inside: Bools, from_file: bool) -> None:
         if self._void is not None:
@@ -296,20 +263,19 @@ def files_of_zone(zone: ZoneConfig) -> list[Path]:
 def zone_mask(zone: ZoneConfig, grid: GridSpec, where: str = "zone") -> Bools:
     """Cells whose middle lies in the polygon (even-odd), or that are painted in the mask. Raises TerrainError if it
     covers none."""
-    named = f"{where} {zone.called!r}"
+    named, side_m = f"{where} {zone.called!r}", grid.resolution_m
     if zone.mask is not None:
         inside, why = mask_of(Path(zone.mask), grid), f"{zone.mask} is 0 everywhere"
     elif zone.polygon is not None:
-        frame, side_m = MapFrame(grid), grid.resolution_m
+        frame = MapFrame(grid)
         corners = corners_of(zone.polygon, frame, f"{named}: polygon")
         inside = polygon_mask([(col * side_m, row * side_m) for row, col in corners], grid)
         why = extent_of(frame)
     else:
         inside = polygon_mask(zone.polygon_m or (), grid)
-        width, height = grid.cols * grid.resolution_m, grid.rows * grid.resolution_m
         why = (
-            f"it lies outside the terrain of {width:.0f} m x {height:.0f} m; its corners are metres east and south"
-            " of the north-west corner"
+            f"it lies outside the terrain of {grid.cols * side_m:.0f} m x {grid.rows * side_m:.0f} m; its corners"
+            " are metres east and south of the north-west corner"
         )
     if not inside.any():
         raise TerrainError(f"{named} covers no cell of the terrain: {why}")

@@ -44,8 +44,8 @@ def written(path: Path, bands: Any, dtype: str | None = "float32", **profile: An
     return path
 
 
-def load(path: Path, **keys: Any) -> Source:
-    return load_source(TerrainConfig(source=str(path), **keys), seed=1)
+def load(source: Path | str, **keys: Any) -> Source:
+    return load_source(TerrainConfig(source=str(source), **keys), seed=1)
 
 
 def is_water(source: Source) -> Any:

@@ -8,6 +8,7 @@ interpolated: a cell takes the nearest code, or the most frequent one where cell
 from __future__ import annotations
 
 import math
+import os
 import tomllib
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
@@ -114,11 +115,6 @@ TABLES, OTHERS = _built_in()
 """Built-in tables by what the setting calls them; and codes of maps that built-in ones are not to be taken for."""
 
 
-def own_grounds(classes: Mapping[str, CoverGround]) -> dict[int, Ground]:
-    """`terrain.cover_classes` by code."""
-    return {int(code): ground_of(value) for code, value in classes.items()}
-
-
 def read_cover_table(path: Path) -> CoverTable:
     """A table of the user's own: lines of code and class, pace factor or "lethal", and a name if there is one.
 
@@ -162,19 +158,6 @@ def _value(cell: str, what: str) -> CoverGround:
         expected = f"expected {kinds}, lethal, or a pace such as 1.5"
         raise TerrainError(f"{what}: {cell[:40]!r} is no ground; {expected}") from error
     return value
-
-
-def table_named(name: str) -> CoverTable:
-    """Returns the table named by `terrain.cover_codes`: a built-in table, or a CSV file.
-
-    Raises TerrainError if it is neither.
-    """
-    if name in TABLES:
-        return TABLES[name]
-    path = Path(name)
-    if not path.is_file():
-        raise TerrainError(f"terrain.cover_codes {name!r} is neither {', '.join(TABLES)} nor a CSV file")
-    return read_cover_table(path)
 
 
 def some(codes: Iterable[int]) -> str:
@@ -338,11 +321,13 @@ def meaning_of(dataset: Any, what: str, config: TerrainConfig) -> tuple[CoverTab
 
     Raises TerrainError if the values of the file are not codes (whole numbers), or if several code tables fit.
     """
-    own = own_grounds(config.cover_classes)
+    own = {int(code): ground_of(value) for code, value in config.cover_classes.items()}
     sample = sampled_codes(dataset, what)
-    if config.cover_codes is not None:
-        how = f"as terrain.cover_codes = {config.cover_codes!r} says"
-        return table_named(config.cover_codes).replaced(own), how
+    if (name := config.cover_codes) is not None:
+        if name not in TABLES and not os.path.isfile(name):  # also of a name that is too long
+            raise TerrainError(f"terrain.cover_codes {name!r} is neither {', '.join(TABLES)} nor a CSV file")
+        table = TABLES[name] if name in TABLES else read_cover_table(Path(name))
+        return table.replaced(own), f"as terrain.cover_codes = {name!r} says"
     only_own = CoverTable("own", "codes of one's own", own), "as terrain.cover_classes says"
     if own and set(np.unique(sample).tolist()) <= own.keys() | {0}:
         return only_own

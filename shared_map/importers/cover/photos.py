@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from rasterio.enums import ColorInterp
 
 from shared_map.array_files import Bools, Bytes, Floats
-from shared_map.importers.georeference import Placed, place_on
+from shared_map.importers.georeference import place_on
 from shared_map.importers.raster_files import middle_of, opened, sampled
 from shared_map.terrain.row_bands import Progress, no_progress
 from swarm.errors import TerrainError
@@ -75,42 +75,37 @@ def read_photo(path: Path, grid: GridSpec, given_crs: str | None, progress: Prog
         placed = place_on(dataset, grid, None if dataset.crs else given_crs, what)
         size = f"{dataset.height} x {dataset.width} pixels"
         notes = [str(path), f"photo: {size}, covers {placed.share:.1%} of the terrain"]
-        return _read(placed, notes, progress)
+        indexes, palette = _colour_bands(dataset)
+        low, high = (0.0, 0.0) if palette is not None else _stretch(dataset, indexes, notes)
+        if len(indexes) == 1 and palette is None:
+            notes.append("the photo is grey: without colour, what covers the ground is a guess")
 
+        def colours(raw: Floats) -> tuple[Bytes, Bools]:
+            """(colours, black where there are none; where there are any)."""
+            seen = np.asarray(np.isfinite(raw).all(axis=0), np.bool_)
+            raw = np.where(seen, raw, np.float32(0))
+            if high > low:
+                raw = np.clip((raw - np.float32(low)) * np.float32(255 / (high - low)), 0, 255)
+            if palette is not None:
+                looked_up = palette.take(raw[0].astype(np.intp), axis=0, mode="wrap")
+                return looked_up[..., :3] * seen[..., None], seen & (looked_up[..., 3] > 0)
+            return np.moveaxis(raw.astype(np.uint8), 0, -1) * seen[..., None], seen
 
-def _read(placed: Placed, notes: list[str], progress: Progress) -> Photo:
-    dataset, grid = placed.dataset, placed.grid
-    indexes, palette = _colour_bands(dataset)
-    low, high = (0.0, 0.0) if palette is not None else _stretch(dataset, indexes, notes)
-    if len(indexes) == 1 and palette is None:
-        notes.append("the photo is grey: without colour, what covers the ground is a guess")
-
-    def colours(raw: Floats) -> tuple[Bytes, Bools]:
-        """(colours, black where there are none; where there are any)."""
-        seen = np.asarray(np.isfinite(raw).all(axis=0), np.bool_)
-        raw = np.where(seen, raw, np.float32(0))
-        if high > low:
-            raw = np.clip((raw - np.float32(low)) * np.float32(255 / (high - low)), 0, 255)
-        if palette is not None:
-            looked_up = palette.take(raw[0].astype(np.intp), axis=0, mode="wrap")
-            return looked_up[..., :3] * seen[..., None], seen & (looked_up[..., 3] > 0)
-        return np.moveaxis(raw.astype(np.uint8), 0, -1) * seen[..., None], seen
-
-    rgb = np.empty((grid.rows, grid.cols, 3), np.uint8)
-    seen = np.empty((grid.rows, grid.cols), np.bool_)
-    how = "nearest" if palette is not None else "average" if placed.grows else "bilinear"
-    for rows, raw in placed.on_grid(how, indexes, "reading photo", progress):
-        rgb[rows], seen[rows] = colours(raw)
-    if not seen.any():
-        raise TerrainError(f"photo {dataset.name} shows nothing of the terrain: all of it is nodata or transparent")
-    if not seen.all():
-        notes.append(f"the photo shows nothing of {1 - seen.mean():.1%} of the terrain, whose class is unknown")
-    # Looked for in the file's own pixels: between two colours of a legend an interpolation makes others.
-    middle = middle_of(dataset, _MOST_SIDE)
-    own, shows = colours(dataset.read(indexes, window=middle).astype(np.float32))
-    own = np.broadcast_to(own, (*shows.shape, 3))
-    other = why_not_true_colour(own, shows & (dataset.dataset_mask(window=middle) > 0))
-    return Photo(rgb, seen, tuple(notes), other)
+        rgb = np.empty((grid.rows, grid.cols, 3), np.uint8)
+        seen = np.empty((grid.rows, grid.cols), np.bool_)
+        how = "nearest" if palette is not None else "average" if placed.grows else "bilinear"
+        for rows, raw in placed.on_grid(how, indexes, "reading photo", progress):
+            rgb[rows], seen[rows] = colours(raw)
+        if not seen.any():
+            raise TerrainError(f"{what} shows nothing of the terrain: all of it is nodata or transparent")
+        if not seen.all():
+            notes.append(f"the photo shows nothing of {1 - seen.mean():.1%} of the terrain, whose class is unknown")
+        # Looked for in the file's own pixels: between two colours of a legend an interpolation makes others.
+        middle = middle_of(dataset, _MOST_SIDE)
+        own, shows = colours(dataset.read(indexes, window=middle).astype(np.float32))
+        own = np.broadcast_to(own, (*shows.shape, 3))
+        other = why_not_true_colour(own, shows & (dataset.dataset_mask(window=middle) > 0))
+        return Photo(rgb, seen, tuple(notes), other)
 
 
 def _colour_bands(dataset: Any) -> tuple[list[int], NDArray[np.uint8] | None]:

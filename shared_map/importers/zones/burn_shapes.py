@@ -9,7 +9,6 @@ from __future__ import annotations
 import warnings
 from collections.abc import Sequence
 from contextlib import suppress
-from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -23,10 +22,10 @@ from rasterio.warp import transform as to_crs
 from shared_map.array_files import Floats
 from shared_map.importers.georeference import bounds_in, crs_name, reprojecting, system_named, systems_of
 from shared_map.importers.zones.vector_files import Features, Layer, parts_of, unusable
+from shared_map.importers.zones.zone_files import FileFacts
 from swarm.errors import TerrainError
 from swarm.grid import GridSpec, Window
 
-Box = tuple[float, float, float, float]
 Floats64 = NDArray[np.float64]
 MOST_FEATURES, MOST_CORNERS = 500_000, 20_000_000
 """Limits of one layer on the terrain."""
@@ -48,21 +47,6 @@ _NUDGE = (1.3e-4, 0.7e-4)
 drives from one to the other between closed cells. Only rounded coordinates touch cells exactly."""
 
 
-@dataclass(frozen=True, eq=False)
-class Shapes:
-    """Simple shapes (points, lines, polygons) in cell coordinates.
-
-    of       int64 (n,)  which feature each is a part of
-    mended   ids of features that crossed themselves, or whose rings were not closed
-    outside  how many features lie outside of the terrain
-    """
-
-    shapes: NDArray[Any]
-    of: NDArray[np.int64]
-    mended: list[str]
-    outside: int
-
-
 class Placing:
     """Transformation of a layer's coordinates onto a grid.
 
@@ -74,6 +58,8 @@ class Placing:
         Its system, as the scenario has it; "local" is that of a terrain without a place.
     margin_m : float
         So far outside the grid shapes are still of use.
+    facts : FileFacts
+        What is done is entered there.
 
     Raises
     ------
@@ -81,48 +67,41 @@ class Placing:
         If the system is not known or none, or the layer does not touch the terrain.
     """
 
-    def __init__(self, grid: GridSpec, layer: Layer, crs: str | None, margin_m: float) -> None:
-        self.grid, self.layer = grid, layer
+    def __init__(self, grid: GridSpec, layer: Layer, crs: str | None, margin_m: float, facts: FileFacts) -> None:
+        self._grid, self._layer, self._facts = grid, layer, facts
         own = None
         with suppress(TerrainError):
             own = system_named(layer.crs, layer.what)
         self._target, self._crs = systems_of(grid, own, crs, layer.what, "crs")
-        self._margin_cells = margin_m / grid.resolution_m + 2.0
-        with reprojecting(self.layer.what, self._crs, self._target):
-            self._box = self._extent()
+        facts.crs = "local" if self._crs is None else crs_name(self._crs)
+        self._moves = bool(self._crs != self._target)
         self._degrees = self._crs is not None and bool(self._crs.is_geographic)
         self._shifts = [0.0, -360.0, 360.0] if self._degrees else [0.0]
         self._reach = np.full(4, np.nan)
         self._touched, self._features, self._corners = False, 0, 0
-
-    @property
-    def crs(self) -> str:
-        """The system of the layer, for people."""
-        return "local" if self._crs is None else crs_name(self._crs)
-
-    def _extent(self) -> Box:
-        """The terrain with its margin, in the layer's coordinates; degrees go on beyond 180."""
-        grid, out = self.grid, self._margin_cells * self.grid.resolution_m
-        rows, cols = grid.rows + 2 * self._margin_cells, grid.cols + 2 * self._margin_cells
-        west, north = grid.west_m - out, grid.north_m + out
-        if self._crs is None or self._crs == self._target:
-            return west, north - rows * grid.resolution_m, west + cols * grid.resolution_m, north
-        around = from_origin(west, north, grid.resolution_m, grid.resolution_m)
-        box = bounds_in(around, rows, cols, self._target, self._crs)  # type: ignore[arg-type]
-        # The border was looked at in some of its points only, and may bulge between them.
-        wide, high = 0.01 * (box[2] - box[0]), 0.01 * (box[3] - box[1])
-        return box[0] - wide, box[1] - high, box[2] + wide, box[3] + high
+        # The terrain with its margin, in the layer's coordinates; degrees go on beyond 180.
+        side_m, out = grid.resolution_m, margin_m / grid.resolution_m + 2.0
+        rows, cols = grid.rows + 2 * out, grid.cols + 2 * out
+        west, north = grid.west_m - out * side_m, grid.north_m + out * side_m
+        self._box = west, north - rows * side_m, west + cols * side_m, north
+        if self._moves:
+            around = from_origin(west, north, side_m, side_m)
+            with reprojecting(layer.what, self._crs, self._target):
+                west, south, east, north = bounds_in(around, rows, cols, self._target, self._crs)  # type: ignore[arg-type]
+            # The border was looked at in some of its points only, and may bulge between them.
+            wide, high = 0.01 * (east - west), 0.01 * (north - south)
+            self._box = west - wide, south - high, east + wide, north + high
 
     def check_touched(self) -> None:
         """Raises TerrainError if the layer holds no feature, or none that was placed is on the terrain."""
-        what = self.layer.what
+        what = self._layer.what
         if np.isnan(self._reach).any():
             raise TerrainError(f"{what} holds no feature")
         if not self._touched:
             hint = "are x and y in reverse?" if self._reversed(self._reach[None])[0] else "is crs right?"
             raise TerrainError(
                 f"{what} does not touch the terrain: it reaches from {_shown(*self._reach)}, the terrain from"
-                f" {_shown(*self._box)} in {self.crs}; {hint}"
+                f" {_shown(*self._box)} in {self._facts.crs}; {hint}"
             )
 
     def _on(self, bounds: Floats64) -> NDArray[np.bool_]:
@@ -141,22 +120,27 @@ class Placing:
 
     def _check_bounds(self, features: Features, bounds: Floats64) -> None:
         """Raises TerrainError if it is not sure where features lie."""
-        what = self.layer.what
+        what = self._layer.what
         if self._degrees:
             wrong = (np.abs(bounds[:, ::2]).max(axis=1) > 540) | (np.abs(bounds[:, 1::2]).max(axis=1) > 90.0001)
             for n in np.flatnonzero(wrong)[:1]:
                 raise TerrainError(
                     f"{what}: feature {features.id(features.of[n])} reaches from {_shown(*bounds[n])}, which"
-                    f" are no degrees, as {self.crs} has them; set crs"
+                    f" are no degrees, as {self._facts.crs} has them; set crs"
                 )
             for n in np.flatnonzero(bounds[:, 2] - bounds[:, 0] > 180):
                 if _jumps(features.shapes[n]):
-                    raise _unusable(what, features, n, "an edge of it spans more than 180 degrees: cut it at 180")
+                    raise unusable(
+                        what,
+                        features.id(features.of[n]),
+                        "an edge of it spans more than 180 degrees: cut it at 180",
+                    )
         for n in np.flatnonzero(self._reversed(bounds)) if self._touched or self._on(bounds).any() else ():
-            raise _unusable(what, features, n, "it is on the terrain only if x and y change places")
+            raise unusable(what, features.id(features.of[n]), "it is on the terrain only if x and y change places")
 
-    def place(self, features: Features) -> Shapes:
-        """Features in cells. Raises TerrainError, which names the feature, if one cannot be placed."""
+    def place(self, features: Features) -> tuple[NDArray[Any], NDArray[np.int64]]:
+        """Simple shapes (points, lines, polygons) in cells, and of which feature each is a part. Raises
+        TerrainError, which names the feature, if one cannot be placed."""
         with np.errstate(all="ignore"):  # coordinates of damaged files may be as large as numbers are
             bounds = shapely.bounds(features.shapes)
             if len(bounds):
@@ -169,62 +153,48 @@ class Placing:
             self._corners += int(shapely.get_num_coordinates(features.shapes[near]).sum())
             if self._features > MOST_FEATURES or self._corners > MOST_CORNERS:
                 raise TerrainError(
-                    f"{self.layer.what} has over {MOST_FEATURES} features or {MOST_CORNERS} corners; simplify it"
+                    f"{self._layer.what} has over {MOST_FEATURES} features or {MOST_CORNERS} corners; simplify it"
                 )
-            of = features.of[near]
-            shapes, of, mended = _mended(features, near, self.layer.what)
+            shapes, of, mended = _mended(features, near, self._layer.what)
             placed = [self._placed(shapes, of, shift, features) for shift in self._shifts]
-        outside = len(features.numbers) - len(np.unique(of))
-        return Shapes(
-            np.concatenate([each for each, _ in placed]),
-            np.concatenate([each for _, each in placed]),
-            sorted({*mended, *map(features.id, features.closed.tolist())}),
-            outside,
-        )
+        self._facts.features += len(features.numbers)
+        self._facts.outside += len(features.numbers) - len(np.unique(of))
+        self._facts.mended += sorted({*mended, *map(features.id, features.closed.tolist())})
+        return np.concatenate([each for each, _ in placed]), np.concatenate([each for _, each in placed])
 
     def _placed(
         self, shapes: NDArray[Any], of: NDArray[np.int64], shift: float, features: Features
     ) -> tuple[NDArray[Any], NDArray[np.int64]]:
         """The parts of shapes within the terrain's box that is turned by some degrees."""
-
         box = (self._box[0] + shift, self._box[1], self._box[2] + shift, self._box[3])
         shapes, within = _simple(np.asarray(shapely.clip_by_rect(shapes, *box), object))
-        of = of[within]
-        if self._crs is not None and self._crs != self._target:
+        of, grid = of[within], self._grid
+
+        def to_cells(points: Floats64) -> Floats64:
+            xs, ys = points[:, 0] - shift, points[:, 1]
+            if self._moves and len(points):
+                xs, ys = map(np.asarray, to_crs(self._crs, self._target, xs, ys))
+            return np.stack([xs - grid.west_m, grid.north_m - ys], axis=1) / grid.resolution_m
+
+        if self._moves:
             unit_m = _DEG_M if self._degrees else float(self._crs.linear_units_factor[1])
             shapes = shapely.segmentize(shapes, _STEP_M / unit_m)
-        with reprojecting(self.layer.what, self._crs, self._target):
-            shapes = shapely.transform(shapes, lambda points: self._to_cells(points, -shift))
+        with reprojecting(self._layer.what, self._crs, self._target):
+            shapes = shapely.transform(shapes, to_cells)
         for n in of[~np.isfinite(shapely.bounds(shapes)).all(axis=1)]:
-            raise unusable(self.layer.what, features.id(n), "it has no place in the terrain's system")
+            raise unusable(self._layer.what, features.id(n), "it has no place in the terrain's system")
         return shapes, of
-
-    def _to_cells(self, points: NDArray[np.float64], shift: float) -> NDArray[np.float64]:
-        xs, ys = points[:, 0] + shift, points[:, 1]
-        if self._crs is not None and self._crs != self._target and len(points):
-            moved = to_crs(self._crs, self._target, xs, ys)
-            xs, ys = np.asarray(moved[0]), np.asarray(moved[1])
-        grid = self.grid
-        return np.stack([(xs - grid.west_m) / grid.resolution_m, (grid.north_m - ys) / grid.resolution_m], axis=1)
-
-
-def _unusable(what: str, features: Features, shape: Any, why: str) -> TerrainError:
-    return unusable(what, features.id(features.of[shape]), why)
 
 
 def _shown(west: float, south: float, east: float, north: float) -> str:
     return f"{west:.7g}, {south:.7g} to {east:.7g}, {north:.7g}"
 
 
-def _jumps(geometry: Any) -> bool:
-    """Returns True if an edge spans more than half of the globe, and not all of it."""
-    parts, _ = _simple(np.array([geometry], object))
-    for part in parts:
-        for ring in shapely.get_rings(part) if part.geom_type == "Polygon" else [part]:
-            jumps = np.abs(np.diff(shapely.get_coordinates(ring)[:, 0]))
-            if ((jumps > 180) & (jumps < 359.999)).any():
-                return True
-    return False
+def _jumps(shape: Any) -> bool:
+    """Returns True if an edge of a simple shape spans more than half of the globe, and not all of it."""
+    lines = shapely.get_rings(shape) if shape.geom_type == "Polygon" else [shape]
+    wide = np.abs(np.concatenate([np.diff(shapely.get_coordinates(line)[:, 0]) for line in lines]))
+    return bool(((wide > 180) & (wide < 359.999)).any())
 
 
 def _simple(geometries: NDArray[Any]) -> tuple[NDArray[Any], NDArray[np.int64]]:
@@ -249,10 +219,10 @@ def _mended(
     wrong = np.flatnonzero(polygons)[~shapely.is_valid(shapes[polygons])]
     for n in wrong:
         if _crossings(shapes[n]) > _MOST_CROSSINGS:
-            raise _unusable(what, features, n, "it crosses itself thousands of times")
+            raise unusable(what, features.id(features.of[n]), "it crosses itself thousands of times")
         shapes[n] = shapely.make_valid(shapes[n], method="structure", keep_collapsed=False)
         if shapely.is_empty(shapes[n]):
-            raise _unusable(what, features, n, "it encloses no ground")
+            raise unusable(what, features.id(features.of[n]), "it encloses no ground")
     simple, within = _simple(shapes[near])
     return simple, features.of[near][within], {features.id(features.of[n]) for n in wrong}
 

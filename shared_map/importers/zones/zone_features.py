@@ -9,17 +9,17 @@ import json
 import math
 import re
 import tomllib
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 import shapely
+from numpy.typing import NDArray
 
-from shared_map.importers.zones.burn_shapes import POLYGON, Drawn, Placing, Shapes
-from shared_map.importers.zones.shape_texts import INCLUSION
-from shared_map.importers.zones.vector_files import Features, Layer, open_layers, read_features, unusable
+from shared_map.importers.zones.burn_shapes import POLYGON, Drawn, Placing
+from shared_map.importers.zones.vector_files import INCLUSION, Features, Layer, open_layers, read_features, unusable
 from shared_map.importers.zones.zone_files import LEAST, MOST, FileFacts
 from swarm.config.ground import WayConfig, ZoneConfig
 from swarm.errors import TerrainError
@@ -41,22 +41,20 @@ class Way:
 
 
 _TABLES = tomllib.loads((Path(__file__).parent / "ways.toml").read_text(encoding="utf-8"))
+_EXTENTS: Mapping[str, Sequence[float]] = _TABLES.pop("extents")
+"""Columns for the extent of points and lines, in any letter case -> (width / value, largest width in metres)."""
 
 
-def _built_in(kind: Kind) -> dict[str, Way]:
-    rows = _TABLES[kind].items()
-    return {name: Way(width_m, None if factor == "lethal" else factor) for name, (width_m, factor) in rows}
-
-
-BUILT_IN: Mapping[Kind, Mapping[str, Way]] = {"road": _built_in("road"), "water": _built_in("water")}
+BUILT_IN: Mapping[str, Mapping[str, Way]] = {
+    kind: {name: Way(width_m, None if factor == "lethal" else factor) for name, (width_m, factor) in rows.items()}
+    for kind, rows in _TABLES.items()
+}
 COLUMNS: Mapping[Kind, tuple[str, ...]] = {
     "road": ("highway", "fclass"),
     "water": ("waterway", "natural", "landuse", "fclass"),
 }
 """Columns of the class: OSM's own keys, and the one of extracts as Shapefiles."""
 TAGS = ("bridge", "tunnel", "area", "inclusion")
-_EXTENTS: Mapping[str, Sequence[float]] = _TABLES["extents"]
-"""Columns for the extent of points and lines, in any letter case -> (width / value, largest width in metres)."""
 PACKED = ("other_tags", "tags")
 """Columns that hold further tags: as GDAL writes them, or JSON."""
 
@@ -130,15 +128,6 @@ def width_of(tags: Mapping[str, str]) -> float | None:
     return None
 
 
-def is_bridge(tags: Mapping[str, str]) -> bool:
-    return tags.get("bridge", "no").lower() not in _NOT_A_BRIDGE
-
-
-def is_tunnel(tags: Mapping[str, str]) -> bool:
-    """Returns True if it runs below the ground: a map of one level has no place for it."""
-    return tags.get("tunnel", "no").lower() not in _NO
-
-
 _WIDEST_M = 1000.0
 """Lines that run so far outside the terrain are of no use to it."""
 Corner = tuple[float, float]
@@ -150,14 +139,15 @@ _TOLERANCES_CELLS = (0.01, 0.05, 0.1, 0.25)
 """Tolerances for dropped corners, tried in order until few enough are left."""
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(eq=False)
 class Drawing:
     """Shapes of a zone's file on a grid, in cells.
 
     values   with a factor or pace
     lethal   closed, each with its width
-    kept     all else is closed; empty if nothing is kept in
+    kept     all else is closed
     bridges  of roads
+    keeps    whether the file keeps in, be it by nothing on the terrain
     """
 
     facts: FileFacts
@@ -174,37 +164,20 @@ def draw_zone(zone: ZoneConfig, grid: GridSpec, what: str) -> Drawing:
     path = Path(zone.file or "")
     layers = open_layers(path, zone.layer, what)
     facts = FileFacts(path.name, ", ".join(layer.name for layer in layers), "")
-    drawing, used, keeps = Drawing(facts), 0, False
-    faults = []
+    drawing, faults = Drawing(facts), []
     for layer in layers:
-        worth = _Worth(zone, layer, facts)
-        placing = Placing(grid, layer, zone.crs, _margin_m(zone, layer))
-        facts.crs = placing.crs
+        worth = _Worth(zone, grid, layer, drawing)
+        placing = Placing(grid, layer, zone.crs, _margin_m(zone, layer), facts)
         for features in read_features(layer, worth.columns):
-            placed = placing.place(features)
-            inclusion = features.columns.get(INCLUSION, np.zeros(0, object))
-            keeps |= worth.closes and bool((inclusion == "yes").any())
-            facts.features += len(features.numbers)
-            facts.outside += placed.outside
-            facts.mended += placed.mended
-            names = set()
-            for shape, id, way, bridge, inside in worth.of(features, placed):
-                names.add(id)
-                drawn = Drawn(shape, way.factor or 1.0, way.width_m / grid.resolution_m)
-                closing = drawing.kept if inside else drawing.lethal
-                (closing if way.factor is None else drawing.values).append(drawn)
-                if bridge:
-                    drawing.bridges.append(drawn)
-            used += len(names)
+            worth.draw(features, *placing.place(features))
         try:
             placing.check_touched()
         except TerrainError as error:
             faults.append(error)
-    facts.used = used
     if len(faults) == len(layers):
         raise faults[0]
     worth.check_used()
-    return replace(drawing, keeps=keeps)
+    return drawing
 
 
 def closed_shapes(drawing: Drawing, grid: GridSpec) -> list[Drawn]:
@@ -233,9 +206,10 @@ class _Worth:
     Raises TerrainError if the zone does not say how to tell.
     """
 
-    def __init__(self, zone: ZoneConfig, layer: Layer, facts: FileFacts) -> None:
-        self._zone, self._layer, self._facts = zone, layer, facts
-        self.closes = zone.kind in ("forbidden", "keep_in")
+    def __init__(self, zone: ZoneConfig, grid: GridSpec, layer: Layer, drawing: Drawing) -> None:
+        self._zone, self._grid, self._layer, self._drawing = zone, grid, layer, drawing
+        self._facts = drawing.facts
+        self._closes = zone.kind in ("forbidden", "keep_in")
         self._kind: Kind | None = zone.kind if zone.kind in ("road", "water") else None
         name, assumed = zone.attribute, () if self._kind is None else COLUMNS[self._kind]
         has_classes = name is not None or not {*assumed, *PACKED}.isdisjoint(layer.columns)
@@ -262,27 +236,37 @@ class _Worth:
         columns = self._layer.columns
         return (", ".join(columns[:20]) + (" ..." if len(columns) > 20 else "")) or "none"
 
-    def of(self, features: Features, placed: Shapes) -> Iterator[tuple[Any, str, Way, bool, bool]]:
-        """Shapes of those features that count: (shape, id, width and factor, whether it is a bridge, whether all
-        else is closed)."""
+    def draw(self, features: Features, shapes: NDArray[Any], of: NDArray[np.int64]) -> None:
+        """Adds the shapes of those features that count; `of` says which feature each is a part of."""
+        drawing, used = self._drawing, set()
+        if self._closes:
+            drawing.keeps |= bool((features.columns.get(INCLUSION, np.zeros(0, object)) == "yes").any())
         ways: dict[tuple[int, bool], tuple[Way | None, bool, bool]] = {}
-        for shape, n in zip(placed.shapes, placed.of.tolist(), strict=True):
-            id = features.id(n)
-            key = n, shape.geom_type == "Polygon"
-            if key not in ways:
+        for shape, n in zip(shapes, of.tolist(), strict=True):
+            is_area = shape.geom_type == "Polygon"
+            if (n, is_area) not in ways:
                 tags = unpacked(features.tags(n))
-                if key[1]:  # an area has its own extent
+                if is_area:  # it has its own extent
                     tags = {name: value for name, value in tags.items() if not states_extent(name)}
-                way = self._way(tags, id)
-                bridge = way is not None and self._kind == "road" and is_bridge(tags)
+                way = self._way(tags, features.id(n))
+                over = tags.get("bridge", "no").lower() not in _NOT_A_BRIDGE
+                bridge = way is not None and self._kind == "road" and over
                 self._facts.bridges += bridge
                 inclusion = tags.get(INCLUSION, "yes" if self._zone.kind == "keep_in" else "no").lower()
-                ways[key] = way, bridge, self.closes and inclusion in ("yes", "true", "1")
-            way, bridge, inside = ways[key]
-            if way is not None:
-                if inside and not way.width_m and shape.geom_type != "Polygon":
-                    raise TerrainError(f"{self._layer.what}: feature {id} keeps in, but is no area; remove it")
-                yield shape, id, way, bridge, inside
+                ways[n, is_area] = way, bridge, self._closes and inclusion in ("yes", "true", "1")
+            way, bridge, inside = ways[n, is_area]
+            if way is None:
+                continue
+            if inside and not way.width_m and not is_area:
+                id = features.id(n)
+                raise TerrainError(f"{self._layer.what}: feature {id} keeps in, but is no area; remove it")
+            used.add(n)
+            drawn = Drawn(shape, way.factor or 1.0, way.width_m / self._grid.resolution_m)
+            closing = drawing.kept if inside else drawing.lethal
+            (closing if way.factor is None else drawing.values).append(drawn)
+            if bridge:
+                drawing.bridges.append(drawn)
+        self._facts.used += len(used)
 
     def _way(self, tags: dict[str, str], id: str) -> Way | None:
         """Width and factor of a feature; None if it is left out, which the facts then tell."""
@@ -301,10 +285,10 @@ class _Worth:
             way = Way(0.0, zone.value or 1.0)
         if way is None:
             return None
-        if kind is not None and is_tunnel(tags):
+        if kind is not None and tags.get("tunnel", "no").lower() not in _NO:  # a map of one level has no place
             self._facts.skip("below the ground", id)
             return None
-        closes = self.closes or (kind == "water" and not name)
+        closes = self._closes or (kind == "water" and not name)
         try:
             own_m = width_of(tags)
         except ValueError as error:

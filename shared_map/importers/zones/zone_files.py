@@ -2,19 +2,61 @@
 
 from __future__ import annotations
 
+import contextlib
+import re
 from collections import Counter
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Literal, NamedTuple
 
 import numpy as np
 
 from shared_map.array_files import Bools, Floats
 from shared_map.importers.georeference import crs_name, place_on
-from shared_map.importers.raster_files import is_raster, opened
-from shared_map.importers.zones.shape_texts import is_vector
+from shared_map.importers.raster_files import beginning, is_raster, opened
 from swarm.config.ground import ZoneConfig
+from swarm.config.input_files import FileKind
 from swarm.errors import TerrainError
 from swarm.grid import GridSpec, Window
+
+
+class Kind(NamedTuple):
+    """A format: GDAL's driver, and how its text is checked; None of a binary format."""
+
+    driver: str
+    text: Literal["json", "xml", "fence"] | None = None
+
+
+# Atomic: what is skipped before the root is read in one way only, or a few hundred bytes would take for ever.
+_ROOT = rb"(?:(?><\?.*?\?>|<!--.*?-->|<!DOCTYPE[^>\[]*>)\s*)*+<(?:\w+:)?%s[\s/>]"
+_KINDS = {
+    rb"\0\0\x27\x0a": Kind("ESRI Shapefile"),
+    rb"fgb\x03fgb": Kind("FlatGeobuf"),
+    rb"SQLite format 3\0.{52}GP": Kind("GPKG"),
+    rb"[{\x1e]": Kind("GeoJSON", "json"),
+    rb"QGC WPL": Kind("GeoJSON", "fence"),
+    _ROOT % b"kml": Kind("LIBKML", "xml"),
+    _ROOT % b"gpx": Kind("GPX", "xml"),
+    _ROOT % b"osm": Kind("OSM", "xml"),
+}
+"""First bytes -> format. GDAL knows 80 formats, some of which name other files."""
+
+
+def kind_of(head: bytes) -> Kind | None:
+    """The format of a file by its first bytes; None if it is not read."""
+    head = head.removeprefix(b"\xef\xbb\xbf").lstrip()
+    return next((kind for begins, kind in _KINDS.items() if re.match(begins, head, re.DOTALL)), None)
+
+
+IN_ARCHIVES = (".shp", ".gpkg", ".geojson", ".json", ".kml", ".gpx", ".osm", ".fgb")
+
+
+def is_vector(path: Path) -> bool:
+    """Returns True if a file begins, or a .zip is, as one that holds features. False if it cannot be opened."""
+    with contextlib.suppress(OSError, TerrainError):
+        return kind_of(beginning(path, IN_ARCHIVES, FileKind.VECTORS, "")[0]) is not None
+    return False
+
 
 _NAMED = 5
 LEAST, MOST = 1e-6, 1e6

@@ -386,7 +386,10 @@ def test_a_fence_keeps_in_and_keeps_out(tmp_path: Path) -> None:
         painted([ZoneConfig(kind="keep_in", file=line)])
 
 
-@pytest.mark.parametrize("name", ["fifo", "folder", "/dev/zero", "x" * 5000, "nowhere", "a\0b"])
+LONG = "x" * 5000
+
+
+@pytest.mark.parametrize("name", ["fifo", "folder", "/dev/zero", LONG, f"{LONG}.csv", "nowhere", "a\0b"])
 def test_what_is_no_file_is_refused_at_once(tmp_path: Path, name: str) -> None:
     path = tmp_path / name
     if name == "fifo":
@@ -402,6 +405,13 @@ def test_what_is_no_file_is_refused_at_once(tmp_path: Path, name: str) -> None:
         painted([zone])
     with pytest.raises(TerrainError, match=r"^cannot read .*: "):
         outlines_of(zone, UTM, 256)
+
+
+@pytest.mark.parametrize("before", [b"<?a?>", b"<!---->", b"<!DOCTYPE a>", b" "])
+def test_what_stands_before_the_root_of_an_xml_is_skipped_in_one_way_only(tmp_path: Path, before: bytes) -> None:
+    (tmp_path / "a.kml").write_bytes(before * 500 + b"<svg/>")
+    with pytest.raises(TerrainError, match="is neither GeoJSON"):
+        painted([ZoneConfig(kind="forbidden", file=str(tmp_path / "a.kml"))])
 
 
 def test_places_in_reverse_are_told_apart_from_places_elsewhere(tmp_path: Path) -> None:

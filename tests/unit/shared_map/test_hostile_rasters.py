@@ -55,13 +55,11 @@ def test_a_file_which_begins_in_the_south_or_east_is_turned(tmp_path: Path, righ
     np.testing.assert_array_equal(load(written(tmp_path / "a.tif", HEIGHTS, transform=place)).elevation_m, turned)
 
 
-def test_level_ground_of_a_large_plain_file_is_looked_for_in_some_of_its_cells(monkeypatch) -> None:
-    from shared_map.importers import water_and_voids as module
-
-    monkeypatch.setattr(module, "MOST_SAMPLED", 2000)
+def test_level_ground_of_a_large_file_is_looked_for_in_some_of_its_cells(tmp_path: Path, monkeypatch) -> None:
+    monkeypatch.setattr("shared_map.importers.height_rasters.MOST_SAMPLED", 2000)
     heights = np.add.outer(np.arange(101) * 2.0, np.arange(83) * 1.0).astype(np.float32) + 50
     heights[20:60, 20:60] = 40
-    _, level, _ = module.looked_at(heights, TerrainConfig(source="dem.asc"))
+    level = load(dem(tmp_path / "large.tif", heights)).level
     assert level.shape == heights.shape
     assert (level != (heights == 40)).mean() < 0.03
 

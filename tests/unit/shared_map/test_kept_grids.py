@@ -15,12 +15,11 @@ from rasterio.control import GroundControlPoint
 from rasterio.shutil import copy
 from rasterio.transform import from_origin
 from support.effort import few
-from support.height_models import written
+from support.height_models import load, written
 from support.zone_shapes import painted
 
-from shared_map.importers.terrain_sources import Source, load_source
 from shared_map.importers.zones.zone_files import burn_zone
-from swarm.config.ground import TerrainConfig, ZoneConfig
+from swarm.config.ground import ZoneConfig
 from swarm.errors import TerrainError
 from swarm.grid import GridSpec
 
@@ -29,10 +28,6 @@ UTM = "EPSG:32632"
 WEST, NORTH = 500_000.0, 5_200_000.0
 HEIGHTS = (300 + 8 * np.sin(np.arange(12) / 3)[:, None] + np.cos(np.arange(15) / 2)).astype(np.float32)
 ROWS, COLS = HEIGHTS.shape
-
-
-def load(source: str | Path, **settings: Any) -> Source:
-    return load_source(TerrainConfig(source=str(source), **settings), seed=1)
 
 
 def rows_of(heights: np.ndarray) -> str:

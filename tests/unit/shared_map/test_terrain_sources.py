@@ -11,11 +11,11 @@ import pytest
 import rasterio
 from rasterio.transform import Affine, from_origin
 from scipy.io import netcdf_file
-from support.height_models import written
+from support.height_models import load, written
 
 from shared_map.importers.cover.photos import read_photo
 from shared_map.importers.georeference import check_size, metres_per_degree
-from shared_map.importers.terrain_sources import Source, load_source
+from shared_map.importers.terrain_sources import Source
 from shared_map.terrain.pace_layers import TerrainClass
 from shared_map.terrain.terrain import build_terrain
 from swarm.config.ground import TerrainConfig
@@ -34,10 +34,6 @@ def heights(rows: int = 40, cols: int = 50) -> np.ndarray:
 
 def write(path: Path, bands: np.ndarray, transform: Affine = UTM, crs: Any = "EPSG:32632", **profile: Any) -> Path:
     return written(path, bands, None, transform=transform, crs=crs, **profile)
-
-
-def load(source: Path | str, **settings: Any) -> Source:
-    return load_source(TerrainConfig(source=str(source), **settings), seed=1)
 
 
 def said(source: Source, words: str) -> bool:

@@ -181,7 +181,7 @@ def test_a_survey_is_recovered_from_a_file_that_was_made_finer(how: str) -> None
 def test_no_large_patch_becomes_ground_in_silence(name: str, how: str, factor: float) -> None:
     heights_m = resampled(model_of(name).heights_m[:256, :256], factor, how)
     found = level_ground(heights_m)
-    patches = level_patches(heights_m, 0.005, 40, 0.0)
+    patches = level_patches(heights_m, 0.005, 40)
     large = (patches.cells > 0.001 * heights_m.size)[patches.labels] & (patches.labels > 0)
     assert float((large & ~found.mask).mean()) <= found.uncertain + 0.002
 
