@@ -46,25 +46,23 @@ _KINDS: Mapping[str, Any] = {
     "place": np.float32,
 }
 """Kind of a column -> its type. A count is not below 0, a time one that a message may have, a place two lengths."""
-_COLUMNS: Mapping[str, tuple[str, str]] = {
-    **{
-        f"{of}_{name}": (f"{of}{table}", kind)
-        for of in ("vehicles", "targets")
-        for name, table, kind in (
-            ("id", "", "text"), ("piece", "", "whole"), ("samples", "", "count"),
-            ("time_ns", " sampled", "time"), ("place_m", " sampled", "place"),
-        )
-    },
-    **{f"captures_{name}": ("captures", kind) for name, kind in (
-        ("id", "text"), ("time_ns", "time"), ("place_m", "place"))},
-    **{f"marks_{name}": ("marks", kind) for name, kind in (
-        ("cells", "count"), ("kinds", "byte"), ("paces", "pace"), ("stamps_ns", "time"))},
-    **{f"routes_{name}": ("routes", kind) for name, kind in (
-        ("vehicle", "text"), ("target", "text"), ("time_ns", "time"), ("start", "whole"), ("cost_s", "real"),
-        ("bound_s", "real"), ("steps", "count"), ("many_legs", "count"))},
-    "routes_directions": ("steps of routes", "byte"),
-    "routes_legs": ("legs of routes", "count"),
+_OF_TRACKS = {"id": "text", "piece": "whole", "samples": "count"}
+_OF_SAMPLES = {"time_ns": "time", "place_m": "place"}
+_TABLES: Mapping[str, tuple[str, Mapping[str, str]]] = {
+    "vehicles": ("vehicles", _OF_TRACKS),
+    "vehicles sampled": ("vehicles", _OF_SAMPLES),
+    "targets": ("targets", _OF_TRACKS),
+    "targets sampled": ("targets", _OF_SAMPLES),
+    "captures": ("captures", {"id": "text", **_OF_SAMPLES}),
+    "marks": ("marks", {"cells": "count", "kinds": "byte", "paces": "pace", "stamps_ns": "time"}),
+    "routes": ("routes", {
+        "vehicle": "text", "target": "text", "time_ns": "time", "start": "whole", "cost_s": "real",
+        "bound_s": "real", "steps": "count", "many_legs": "count",
+    }),
+    "steps of routes": ("routes", {"directions": "byte"}),
+    "legs of routes": ("routes", {"legs": "count"}),
 }  # fmt: skip
+_COLUMNS = {f"{of}_{name}": (table, kind) for table, (of, kinds) in _TABLES.items() for name, kind in kinds.items()}
 """Column of `tracks.npz` -> the table that it belongs to, and its kind. All columns of a table are as long.
 
 A row of vehicles or targets is a piece of a track, and says how many samples it has: all stand track by track.
