@@ -46,11 +46,12 @@ def _moved(lines: Layer, tracks: Sequence[tuple[Track, dict[str, gis.Value]]]) -
             continue
         length_m = _length_m(track.xy_m)
         begins, ends = (gis.moment(track.time_ns[n]) for n in (0, -1))
-        times = dict(zip(gis.TIMED, (begins, ends, len(track.time_ns), length_m), strict=True))
+        told: tuple[gis.Value, ...] = (begins, ends, len(track.time_ns), length_m)
+        values = {**whose, **dict(zip(gis.TIMED, told, strict=True))}
         if length_m == 0:
-            points.features.append(Feature([track.xy_m[:1]], {**whose, **times}))
+            points.features.append(Feature([track.xy_m[:1]], values))
         else:
-            lines.features.append(Feature([track.xy_m], {**whose, **times}, track.time_ns))
+            lines.features.append(Feature([track.xy_m], values, track.time_ns))
     return [lines, points] if points.features else [lines]
 
 
