@@ -459,14 +459,14 @@ class LatestState(Counts):
             if tile < self.grid.tiles:
                 of_tile.setdefault(tile, []).append(marks)
         types = (np.int64, np.uint8, np.float32, np.int64)
-        found = [MarkedCells(*(np.zeros(0, type) for type in types))]
+        found = [MarkedCells._make(np.zeros(0, type) for type in types)]
         for tile, sets in of_tile.items():
             window, stated = self.grid.tile_window(tile), winners(sets, self.moved_ns)
             rows, cols = np.divmod(stated.cells.astype(np.int64), TILE_CELLS)
             rows, cols = rows + window.row0, cols + window.col0
             kept = (stated.kinds != MarkKind.CLEAR) & (rows < window.row1) & (cols < window.col1)
             columns = (rows * self.grid.cols + cols, stated.kinds, stated.paces, stated.stamps_ns)
-            found.append(MarkedCells(*(each[kept] for each in columns)))
+            found.append(MarkedCells._make(each[kept] for each in columns))
         joined = [np.concatenate(each) for each in zip(*found, strict=True)]
         order = np.argsort(joined[0])
         return MarkedCells._make(each[order] for each in joined)

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from launch_scripts.observe.run_folder import REPORT_FILE, lacks, read_report
 from launch_scripts.report import gis_formats as gis
 from launch_scripts.report.gis_formats import Feature, Layer
-from launch_scripts.report.npz_files import TRACKS_FILE, RunTracks, Track, read_tracks
+from launch_scripts.report.report_and_tracks import TRACKS_FILE, RunTracks, Track, read_tracks
 from shared_map.terrain.map_frame import MapFrame, middles_of
 from swarm.errors import ConfigError
 from swarm.files import make_folder

@@ -19,8 +19,8 @@ from launch_scripts.observe.latest_messages import VehicleColumns
 from launch_scripts.observe.run_folder import begin_run, ended, find_run, point_last, read_report
 from launch_scripts.observe.run_recorder import Driven, Recorder
 from launch_scripts.report import plots_and_cards as plots
-from launch_scripts.report import run_picture as picture
-from launch_scripts.report.report_json import TABLES, make_report, write_report
+from launch_scripts.report import run_page_and_map as picture
+from launch_scripts.report.report_and_tracks import TABLES, make_report, write_report
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.clock import NS_PER_S
 from swarm.config.load import load_scenario, parse_scenario

@@ -23,7 +23,7 @@ from support.map_strategies import set_of
 
 from launch_scripts.observe.run_recorder import BegunRoute, Recorder, tracks_of
 from launch_scripts.report.gis_formats import in_degrees, write_layers
-from launch_scripts.report.npz_files import TRACKS_FILE, Track, packed_tracks, read_tracks, tracks_in
+from launch_scripts.report.report_and_tracks import TRACKS_FILE, Track, packed_tracks, read_tracks, tracks_in
 from launch_scripts.report.run_gis_layers import ENDINGS, mark_layer, target_tracks, vehicle_tracks
 from shared_map.keeper.mark_store import KeeperStore
 from shared_map.terrain.map_frame import MapFrame
