@@ -138,22 +138,6 @@ class Sampling(NamedTuple):
     places_m: NDArray[np.float32]
 
 
-Tracks = dict[TrackKey, tuple[NDArray[np.int64], NDArray[np.float32]]]
-"""Per key, when each place was sampled, int64 (n,), and the places (n, 2): east, south, in metres."""
-
-
-def tracks_of(samplings: Sequence[Sampling]) -> Tracks:
-    """The places of each key, in order of time."""
-    points: dict[TrackKey, list[tuple[int, NDArray[np.float32]]]] = {}
-    for time_ns, keys, places_m in samplings:
-        for key, place in zip(keys, places_m, strict=True):
-            points.setdefault(key, []).append((time_ns, place))
-    return {
-        key: (np.array([at for at, _ in each], np.int64), np.array([place for _, place in each]))
-        for key, each in points.items()
-    }
-
-
 # --- results per target, group and vehicle ------------------------------------------------------------------------
 
 _MOST_VEHICLES = 100_000

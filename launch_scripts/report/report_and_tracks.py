@@ -14,6 +14,7 @@ import io
 import json
 import math
 import zipfile
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -26,7 +27,7 @@ from numpy.typing import NDArray
 from launch_scripts.observe.latest_messages import MarkedCells
 from launch_scripts.observe.palette import image_bytes
 from launch_scripts.observe.run_folder import REPORT_FILE, ended
-from launch_scripts.observe.run_recorder import Recorder, tracks_of
+from launch_scripts.observe.run_recorder import Recorder
 from shared_map.learning.learned_factors import factors_in, learned_kinds
 from shared_map.terrain.pyramid import Level
 from shared_map.terrain.terrain import Terrain
@@ -251,14 +252,18 @@ def packed_tracks(recorder: Recorder) -> bytes:
     observed, captures, begun = recorder.observed, recorder.captures, recorder.routes.kept
     began_ns, routes = observed.began_ns or 0, [each.route for each in begun]
     columns: dict[str, Any] = {}
-    for of, tracks in (("vehicles", recorder.vehicle_tracks), ("targets", recorder.target_tracks)):
-        lines = dict(sorted(tracks_of(tracks.kept).items()))
+    for of, sampled in (("vehicles", recorder.vehicle_tracks.kept), ("targets", recorder.target_tracks.kept)):
+        keys = [key for each in sampled for key in each.keys]
+        order = sorted(range(len(keys)), key=keys.__getitem__)  # stable: a piece stays in order of time
+        times_ns = [each.time_ns for each in sampled for _ in each.keys]
+        places_m = np.concatenate([np.zeros((0, 2)), *(each.places_m for each in sampled)])
+        pieces = sorted(Counter(keys).items())
         columns |= {
-            f"{of}_id": [id for id, _ in lines],
-            f"{of}_piece": [piece for _, piece in lines],
-            f"{of}_samples": [len(times) for times, _ in lines.values()],
-            f"{of}_time_ns": [time for times, _ in lines.values() for time in times.tolist()],
-            f"{of}_place_m": np.concatenate([np.zeros((0, 2)), *(places for _, places in lines.values())]),
+            f"{of}_id": [id for (id, _), _ in pieces],
+            f"{of}_piece": [piece for (_, piece), _ in pieces],
+            f"{of}_samples": [samples for _, samples in pieces],
+            f"{of}_time_ns": [times_ns[n] for n in order],
+            f"{of}_place_m": places_m[np.array(order, np.intp)],
         }
     columns |= {
         "captures_id": [each.target for each in captures],
