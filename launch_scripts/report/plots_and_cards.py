@@ -76,7 +76,7 @@ def draw_plot(axes: Axes, plot: Plot, report: Report, *, titled: bool = True) ->
         axes.set_xlim(0, max(report["series"]["t_s"], default=1.0) or 1.0)
         axes.xaxis.set_major_locator(MaxNLocator(6))
         axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g} s" if value else "0"))
-        axes.yaxis.set_major_locator(MaxNLocator(4))
+        axes.yaxis.set_major_locator(MaxNLocator(4, integer=plot.tick not in (_percent, _ms)))
     axes.tick_params(axis="both", which="both", length=0)
     of_values = axes.yaxis if over_time else axes.xaxis
     of_values.set_major_formatter(FuncFormatter(lambda value, _: plot.tick(value) if value else "0"))
