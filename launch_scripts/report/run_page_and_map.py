@@ -70,6 +70,7 @@ def draw_map(axes: Axes, tracks: RunTracks, report: Mapping[str, Any]) -> None:
     """Draws a run, but not its ground, on axes in kilometres east and south of the north-west corner."""
     grid = tracks.grid
     width_km, height_km = size_km(grid)
+    axes.set(xlim=(0, width_km), ylim=(height_km, 0), aspect="equal")  # first: labels go by them
     if len(tracks.marks.cells):
         axes.imshow(mark_overlay(tracks), extent=(0, width_km, height_km, 0), interpolation="none", zorder=2)
     samples = sum(len(track.time_ns) for track in (*tracks.vehicles, *tracks.targets))
@@ -98,7 +99,6 @@ def draw_map(axes: Axes, tracks: RunTracks, report: Mapping[str, Any]) -> None:
         places[:, 0], places[:, 1], marker="*", s=115, c=palette.YELLOW, edgecolors=palette.BLACK, linewidths=0.7,
         label="capture", zorder=8, gid="captures",
     )  # fmt: skip
-    axes.set(xlim=(0, width_km), ylim=(height_km, 0), aspect="equal")
     axes.grid(False)
     _draw_scale(axes, width_km, height_km)
 
