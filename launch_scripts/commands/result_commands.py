@@ -99,7 +99,7 @@ def report(run: RunArgument = "LAST", runs: Runs = Path("runs")) -> None:
 
     swarm runs report LAST
     """
-    from launch_scripts.report.run_page import write_page
+    from launch_scripts.report.run_page_and_map import write_page
 
     typer.echo(write_page(find_run(run, runs)))
 

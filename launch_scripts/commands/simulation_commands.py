@@ -88,7 +88,7 @@ def _simulate_once(
     from launch_scripts.launcher.console import Terminal, progress
     from launch_scripts.launcher.run_options import find_scenario, make_run_dir, new_run_id
     from launch_scripts.observe.run_folder import begin_run
-    from launch_scripts.report.report_json import with_series, write_report
+    from launch_scripts.report.report_and_tracks import with_series, write_report
     from launch_scripts.simulation.sample_worlds import WORLDS
     from launch_scripts.simulation.simulate import Simulation, run_to_end
 

@@ -33,7 +33,7 @@ from launch_scripts.observe.run_recorder import Recorder
 from launch_scripts.observe.run_registry import LAUNCHER_LOG, register
 from launch_scripts.ports import check_ports, page_of
 from launch_scripts.process_table import LAUNCHER, RECORDED_BESIDE, TABLE, ProcessSpec
-from launch_scripts.report.report_json import make_report, write_report
+from launch_scripts.report.report_and_tracks import make_report, write_report
 from launch_scripts.web.live_page import LivePage, when_free
 from shared_map.array_files import Floats
 from shared_map.terrain.store import load_beside, load_terrain, load_truth, prepare, scenario_key

@@ -5,6 +5,7 @@ Every display of a fact takes its label and its text from here, so that it reads
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
@@ -141,12 +142,8 @@ TARGET_FACTS: tuple[Fact[TargetLine], ...] = (
 )
 """Facts on show of each target, the most important first: a narrow panel cuts off the end."""
 
-_BY_NAME = {fact.name: fact for fact in FACTS}
-
-
-def fact(name: str) -> Fact[RunState]:
-    """A fact of the table. Raises KeyError on a name that is none."""
-    return _BY_NAME[name]
+fact = {fact.name: fact for fact in FACTS}.__getitem__
+"""A fact of the table by its name. Raises KeyError on a name that is none."""
 
 
 def table(state: RunState, *, always: bool = True) -> tuple[list[str], list[list[str]]]:
@@ -212,7 +209,7 @@ def grouped(alarms: Iterable[Alarm], grid: GridSpec) -> list[tuple[str, list[Ala
 
 def together(alarms: Sequence[Alarm]) -> str:
     """Many alarms of one kind in a line."""
-    first = min(alarms, key=lambda alarm: (alarm.since_s is None, alarm.since_s or 0.0))
+    first = min(alarms, key=lambda alarm: math.inf if alarm.since_s is None else alarm.since_s)
     about = first_of(list(dict.fromkeys(alarm.about for alarm in alarms)))
     when = ("the longest " if first.lasts else "over, the first ") + (first.when or "now")
     return f"{first.label}: {len(alarms)} times, {about}, {when}"
@@ -221,7 +218,8 @@ def together(alarms: Sequence[Alarm]) -> str:
 def for_report(state: RunState) -> dict[str, Any]:
     """Every fact by its name, for a report, and every alarm."""
     return {
-        **{each.name: _plain(each.value(state)) for each in FACTS},
+        **{each.name: each.value(state) for each in FACTS},
+        "certified_gap": state.certified_gap.fields(),
         "alarms": [alarm.fields(state.grid) for alarm in state.alarms],
     }
 
@@ -261,9 +259,3 @@ def verdict(report: Mapping[str, Any], failures: Sequence[str] = ()) -> str:
 _FAULTS = 3
 """Most faults that a verdict names."""
 WELL = "All went well."
-
-
-def _plain(value: Any) -> Any:
-    if isinstance(value, CertifiedGap):
-        return value.fields()
-    return list(value) if isinstance(value, tuple) else value

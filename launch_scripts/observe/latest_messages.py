@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Collection, Iterable
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -164,8 +164,7 @@ def gathered(fleets: Iterable[Fleet]) -> VehicleColumns:
     )
 
 
-@dataclass(frozen=True, slots=True, eq=False)
-class MarkedCells:
+class MarkedCells(NamedTuple):
     """Newest statement per marked cell, over all authors."""
 
     cells: NDArray[np.int64]
@@ -459,15 +458,15 @@ class LatestState(Counts):
         for (_, tile), marks in sorted(self._marks.items()):
             if tile < self.grid.tiles:
                 of_tile.setdefault(tile, []).append(marks)
-        found = []
+        types = (np.int64, np.uint8, np.float32, np.int64)
+        found = [MarkedCells._make(np.zeros(0, type) for type in types)]
         for tile, sets in of_tile.items():
             window, stated = self.grid.tile_window(tile), winners(sets, self.moved_ns)
             rows, cols = np.divmod(stated.cells.astype(np.int64), TILE_CELLS)
             rows, cols = rows + window.row0, cols + window.col0
             kept = (stated.kinds != MarkKind.CLEAR) & (rows < window.row1) & (cols < window.col1)
             columns = (rows * self.grid.cols + cols, stated.kinds, stated.paces, stated.stamps_ns)
-            found.append([each[kept] for each in columns])
-        types = (np.int64, np.uint8, np.float32, np.int64)
-        joined = [np.concatenate([np.zeros(0, type), *(each[n] for each in found)]) for n, type in enumerate(types)]
+            found.append(MarkedCells._make(each[kept] for each in columns))
+        joined = [np.concatenate(each) for each in zip(*found, strict=True)]
         order = np.argsort(joined[0])
-        return MarkedCells(*(each[order] for each in joined))
+        return MarkedCells._make(each[order] for each in joined)

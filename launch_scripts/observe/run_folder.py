@@ -68,17 +68,15 @@ def begin_run(
             write_file(folder / name, text.encode())
         except StoreError as error:
             said.append(str(error))
-    sentences = (point_last(folder), register(folder, is_whole=simulated))
-    return [*said, *(sentence for sentence in sentences if sentence is not None)]
+    said += filter(None, (point_last(folder), register(folder, is_whole=simulated)))
+    return said
 
 
 def ended(folder: Path) -> dict[str, Any]:
     """The facts of `run.json` with the time of now as the run's end, for the report. Empty if there are none."""
     facts = run_facts(folder)
-    if not facts:
-        return {}
-    kept: dict[str, Any] = {name: facts[name] for name in ("began", "versions", "machine") if name in facts}
-    return {"began": kept.pop("began", None), "ended": _now(), **kept}
+    kept: dict[str, Any] = {name: facts[name] for name in ("versions", "machine") if name in facts}
+    return {"began": facts.get("began"), "ended": _now(), **kept} if facts else {}
 
 
 def run_facts(folder: Path) -> dict[str, Any]:

@@ -11,6 +11,7 @@ import itertools
 import time
 from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from typing import Protocol
 
 from launch_scripts.observe.latest_messages import LatestState, plan_of_members, run_of_most
@@ -328,12 +329,9 @@ def ask_learned(bus: Bus, where: object) -> list[MarkSet]:
 
 def frame_of_members(members: Sequence[RunInfo]) -> MapFrame | None:
     """The frame that most of the answers tell of; None if none does."""
-    grids = Counter(grid for info in members if (grid := _grid_of(info)) is not None)
+    grids: Counter[GridSpec] = Counter()
+    for info in members:
+        if info.rows:
+            with suppress(ConfigError):
+                grids[Frame.of(info).grid] += 1
     return MapFrame(grids.most_common(1)[0][0]) if grids else None
-
-
-def _grid_of(info: RunInfo) -> GridSpec | None:
-    try:
-        return Frame.of(info).grid if info.rows else None
-    except ConfigError:
-        return None

@@ -9,11 +9,9 @@ keeps half as many from then on. Kept samples therefore stay evenly spread from 
 
 from __future__ import annotations
 
-import itertools
 import math
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
@@ -76,51 +74,46 @@ class Thinned(Generic[T]):
 
 # --- figures ------------------------------------------------------------------------------------------------------
 
-Buckets = NDArray[np.int64]
-"""(n, 2): bucket and count of a `Histogram`, packed, as a thousand of them are kept."""
-
-
-def buckets_of(buckets: Mapping[int, int]) -> Buckets:
-    """The buckets of a histogram, packed."""
-    return np.array(sorted(buckets.items()), np.int64).reshape(-1, 2)
-
 
 class Sample(NamedTuple):
     """The run at one instant.
 
     shown       name of a series of the report -> its value; None until it is published
-    gap_excess  the histogram of certified gaps - 1 of all routes that were begun until then
+    gap_excess  int64 (n, 2): bucket and count of the histogram of certified gaps - 1 of all routes that were begun
+                until then; packed, as a thousand of them are kept
     at_rest_s   (waiting, standing), seconds of all vehicles together until `driven_s`, as `Driven` counts them
     driven_s    UNIX time of the last count of these; 0 before
     """
 
     shown: dict[str, float | None]
-    gap_excess: Buckets
+    gap_excess: NDArray[np.int64]
     at_rest_s: tuple[float, float]
     driven_s: float
 
 
-def certified_gaps(samples: Sequence[Sample]) -> list[dict[str, float | None]]:
-    """Mean, p95 and max of the certified gaps of the routes that were begun since the sample before, and the number
-    of these routes; the first sample covers all routes until then."""
-    gaps: list[dict[str, float | None]] = []
-    before: dict[int, int] = {}
-    for sample in samples:
-        until = dict(sample.gap_excess.tolist())
-        begun = Histogram({b: more for b, n in until.items() if (more := n - before.get(b, 0)) > 0})
-        gaps.append({**of_excess(begun), "routes": begun.count})
-        before = until
-    return gaps
+def rows_over_time(samples: Sequence[Sample]) -> Iterator[dict[str, float | None]]:
+    """Yields what each sample shows, and what happened since the sample before.
 
-
-def at_once(samples: Sequence[Sample], state: int) -> list[float]:
-    """Mean number of vehicles in a state (of `Sample.at_rest_s`) since the sample before, from their summed seconds
-    in it. A sample without a new count repeats the number before: a run which ends has none."""
-    counts = [0.0] * min(len(samples), 1)
-    for early, late in itertools.pairwise(samples):
-        passed_s, rested_s = late.driven_s - early.driven_s, late.at_rest_s[state] - early.at_rest_s[state]
-        counts.append(max(rested_s, 0.0) / passed_s if passed_s > 0 else counts[-1])
-    return counts
+    Certified gaps are those of the routes which were begun since then; the first sample covers all routes until it.
+    Waiting and standing vehicles are mean numbers, from their summed seconds at rest. A sample without a new count
+    of these repeats the numbers before: a run which ends has none.
+    """
+    gaps_before: dict[int, int] = {}
+    at_once = (0.0, 0.0)
+    for before, sample in zip([*samples[:1], *samples], samples, strict=False):
+        gaps = dict(sample.gap_excess.tolist())
+        begun = Histogram({b: more for b, n in gaps.items() if (more := n - gaps_before.get(b, 0)) > 0})
+        gaps_before, passed_s = gaps, sample.driven_s - before.driven_s
+        if passed_s > 0:
+            waiting_s, standing_s = np.subtract(sample.at_rest_s, before.at_rest_s).clip(0.0) / passed_s
+            at_once = float(waiting_s), float(standing_s)
+        yield {
+            **sample.shown,
+            **{f"certified_gap_{name}": gap for name, gap in of_excess(begun).items()},
+            "routes_begun": begun.count,
+            "waiting_at_once": at_once[0],
+            "standing_at_once": at_once[1],
+        }
 
 
 # --- routes and tracks --------------------------------------------------------------------------------------------
@@ -143,22 +136,6 @@ class Sampling(NamedTuple):
     time_ns: int
     keys: tuple[TrackKey, ...]
     places_m: NDArray[np.float32]
-
-
-Tracks = dict[TrackKey, tuple[NDArray[np.int64], NDArray[np.float32]]]
-"""Per key, when each place was sampled, int64 (n,), and the places (n, 2): east, south, in metres."""
-
-
-def tracks_of(samplings: Sequence[Sampling]) -> Tracks:
-    """The places of each key, in order of time."""
-    points: dict[TrackKey, list[tuple[int, NDArray[np.float32]]]] = {}
-    for time_ns, keys, places_m in samplings:
-        for key, place in zip(keys, places_m, strict=True):
-            points.setdefault(key, []).append((time_ns, place))
-    return {
-        key: (np.array([at for at, _ in each], np.int64), np.array([place for _, place in each]))
-        for key, each in points.items()
-    }
 
 
 # --- results per target, group and vehicle ------------------------------------------------------------------------
@@ -220,40 +197,39 @@ class Driven:
 
 def results(latest: LatestState, driven: Driven, scenario: Scenario) -> dict[str, Any]:
     """`by_target`, `by_group` and `by_vehicle` of the report."""
-    by_vehicle = _by_vehicle(latest, driven, scenario)
+    classes = {group.name: group.vehicle_class for group in scenario.groups}
+    by_vehicle = _by_vehicle(latest, driven, scenario, classes)
     return {
         "by_target": _by_target(latest, scenario),
-        "by_group": _by_group(latest, by_vehicle, scenario),
+        "by_group": _by_group(latest, by_vehicle, classes),
         "by_vehicle": by_vehicle,
     }
 
 
 def _by_target(latest: LatestState, scenario: Scenario) -> dict[str, Any]:
-    captures, gaps = latest.counts_by(CAPTURES_OF), gaps_to(latest)
-    vehicles = latest.vehicles()
+    captures, gaps, vehicles = latest.counts_by(CAPTURES_OF), gaps_to(latest), latest.vehicles()
     return {
         id: {
             "captures": captures.get(id, 0),
             **_gap_fields(gaps.get(id)),
-            "growths": latest.of_job("planner", id, "growths"),
-            "window_growths": latest.of_job("planner", id, "window_growths"),
+            **{name: latest.of_job("planner", id, name) for name in ("growths", "window_growths")},
             "chased_by_at_end": len(vehicles.chasing(id)),
         }
-        for id in _all(scenario.target_ids, captures, gaps, latest.status)
+        for id in dict.fromkeys([*scenario.target_ids, *captures, *gaps, *latest.status])
     }
 
 
-def _by_vehicle(latest: LatestState, driven: Driven, scenario: Scenario) -> dict[str, Any]:
+def _by_vehicle(
+    latest: LatestState, driven: Driven, scenario: Scenario, classes: Mapping[str, str]
+) -> dict[str, Any]:
     planned = {plan.id: plan.group.name for plan in plan_agents(scenario)}
-    classes = {group.name: group.vehicle_class for group in scenario.groups}
     captures, gaps, told = latest.counts_by(CAPTURES_BY), gaps_of(latest), latest.classes()
     totals = dict(zip(driven.ids, driven.totals.T.tolist(), strict=True))
     vehicles = latest.vehicles()
-    last = {id: n for n, id in enumerate(vehicles.ids)}
+    states = dict(zip(vehicles.ids, vehicles.states.tolist(), strict=True))
+    chased = dict(zip(vehicles.ids, vehicles.targets.tolist(), strict=True))
     rows: dict[str, Any] = {}
-    for id in _all([], sorted(driven.ids), captures, gaps):
-        at = last.get(id)
-        chased = -1 if at is None else int(vehicles.targets[at])
+    for id in dict.fromkeys([*sorted(driven.ids), *captures, *gaps]):
         group = planned.get(agent_of(id)) or driven.groups.get(id, "")
         rows[id] = {
             "group": group,
@@ -261,38 +237,34 @@ def _by_vehicle(latest: LatestState, driven: Driven, scenario: Scenario) -> dict
             "captures": captures.get(id, 0),
             **dict(zip(_DRIVEN, totals.get(id, (0.0, 0.0, 0.0)), strict=True)),
             **_gap_fields(gaps.get(id)),
-            "state_at_end": None if at is None else VehicleState(int(vehicles.states[at])).name.lower(),
-            "target_at_end": vehicles.target_ids[chased] if chased >= 0 else None,
+            "state_at_end": VehicleState(states[id]).name.lower() if id in states else None,
+            "target_at_end": vehicles.target_ids[chased[id]] if chased.get(id, -1) >= 0 else None,
         }
     return rows
 
 
-def _by_group(latest: LatestState, by_vehicle: Mapping[str, Any], scenario: Scenario) -> dict[str, Any]:
+def _by_group(latest: LatestState, by_vehicle: Mapping[str, Any], classes: Mapping[str, str]) -> dict[str, Any]:
     proven, unproven = latest.histograms_by(GAPS_OF), latest.counts_by(UNPROVEN_OF)
-    members: dict[str, list[str]] = {group.name: [] for group in scenario.groups}
-    classes = {group.name: group.vehicle_class for group in scenario.groups}
+    members: dict[str, list[str]] = {group: [] for group in classes}
     for id, row in by_vehicle.items():
         members.setdefault(row["group"], []).append(id)
     rows: dict[str, Any] = {}
     for group, ids in members.items():
         excess = merged(proven[id].buckets for id in ids if id in proven)
-        gap = gap_of(excess, sum(unproven.get(id, 0) for id in ids))
         rows[group] = {
             "class": classes.get(group, GROUND),
             "vehicles": len(ids),
             **{name: sum(by_vehicle[id][name] for id in ids) for name in ("captures", *_DRIVEN)},
-            **_gap_fields(gap if gap.routes else None),
+            **_gap_fields(gap_of(excess, sum(unproven.get(id, 0) for id in ids))),
         }
     return rows
 
 
 def _gap_fields(gap: CertifiedGap | None) -> dict[str, Any]:
-    return {"routes": 0 if gap is None else gap.routes, "certified_gap": None if gap is None else gap.fields()}
+    return {"routes": gap.routes, "certified_gap": gap.fields()} if gap and gap.routes else _NO_GAP
 
 
-def _all(first: Iterable[str], *others: Iterable[str]) -> list[str]:
-    """Each id once, in order."""
-    return list(dict.fromkeys([*first, *(id for other in others for id in other)]))
+_NO_GAP: dict[str, Any] = {"routes": 0, "certified_gap": None}
 
 
 # --- the recorder -------------------------------------------------------------------------------------------------
@@ -313,8 +285,7 @@ _CAPTURES_KEPT = 4096
 """Places of captures: those of the first hours of a long run are forgotten, their number is not."""
 
 
-@dataclass(frozen=True, slots=True)
-class Capture:
+class Capture(NamedTuple):
     time_s: float
     target: str
     east_m: float
@@ -382,12 +353,10 @@ class Recorder:
 
     def _capture(self, note: Note, now_ns: int) -> None:
         """Records captures, even of untracked targets: the process that moves them publishes each."""
-        cell = note.cell
-        if note.target is None or cell is None or cell >= self.grid.cells:
-            return
-        x_m, y_m = self.grid.centre_m(cell)
-        east_m, south_m = x_m - self.grid.west_m, self.grid.north_m - y_m
-        self.captures.append(Capture(self.seconds(now_ns), note.target, east_m, south_m))
+        if note.target is not None and note.cell is not None and note.cell < self.grid.cells:
+            x_m, y_m = self.grid.centre_m(note.cell)
+            place_m = x_m - self.grid.west_m, self.grid.north_m - y_m
+            self.captures.append(Capture(self.seconds(now_ns), note.target, *place_m))
 
     def _sample(self, now_ns: int) -> None:
         """Samples what is due: places and what vehicles have driven every half second, figures every second."""
@@ -421,11 +390,11 @@ class Recorder:
             "t_s": state.elapsed_s,
             **{name: getattr(state, name) for name in ("captures", "marks", "messages_per_s")},
             **state.states,
-            "growth_ms_mean": _mean(line.growth_ms for line in state.targets if line.growth_ms is not None),
+            "growth_ms_mean": _mean(line.growth_ms for line in state.targets),
         }
-        gap_excess = buckets_of(self.observed.histogram("followed_gap_excess").buckets)
+        begun = sorted(self.observed.histogram("followed_gap_excess").buckets.items())
         driven_s = (self.driven.at_ns or 0) / NS_PER_S
-        self.samples.add(Sample(shown, gap_excess, (waiting_s, standing_s), driven_s))
+        self.samples.add(Sample(shown, np.array(begun, np.int64).reshape(-1, 2), (waiting_s, standing_s), driven_s))
 
     def report(
         self,
@@ -442,7 +411,7 @@ class Recorder:
             seconds = (observed.last_ns - observed.first_ns) / NS_PER_S
         # Later messages are those of a run that ends: without trackers there is no alarm.
         state = self.summary(observed.moved_ns or observed.last_ns or 0)
-        rates = [rate for sample in self.samples.all() if (rate := sample.shown["messages_per_s"]) is not None]
+        gap = of_excess(observed.histogram("gap_excess"))  # driven cost over optimum, as the planners measured it
         fields = {
             "scenario": self.scenario.name,
             "run_id": run_id,
@@ -461,9 +430,9 @@ class Recorder:
             "lost": state.states["lost"] if observed.fleet_ns is not None else None,
             "marked_cells": len(observed.marked().cells) or None,
             **{name: observed.total(name) for name in _TOTALS},
-            "gap": self._gap(),
+            "gap": gap if self._gap_max is None else {**gap, "max": self._gap_max},
             **{name: quantiles(observed.histogram(name)) for name in TIMINGS},
-            "messages_per_s": _mean(rates),
+            "messages_per_s": _mean(sample.shown["messages_per_s"] for sample in self.samples.all()),
             **results(observed, self.driven, self.scenario),
         }
         numbers = {name: _rounded(value) for name, value in fields.items()}
@@ -472,16 +441,8 @@ class Recorder:
     def series(self) -> dict[str, list[Any]]:
         """The run over time, at about `_POINTS` instants at most: lists with one value per `t_s`."""
         samples = self.samples.all()
-        samples = samples[:: max(1, -(-len(samples) // _POINTS))]
-        gaps = certified_gaps(samples)
-        fields: dict[str, list[Any]] = {
-            **{name: [sample.shown[name] for sample in samples] for name in (samples[0].shown if samples else ())},
-            **{f"certified_gap_{name}": [gap[name] for gap in gaps] for name in ("mean", "p95", "max")},
-            "routes_begun": [gap["routes"] for gap in gaps],
-            "waiting_at_once": at_once(samples, 0),
-            "standing_at_once": at_once(samples, 1),
-        }
-        return {name: [_rounded(value) for value in values] for name, values in fields.items()}
+        rows = list(rows_over_time(samples[:: max(1, -(-len(samples) // _POINTS))]))
+        return {name: [_rounded(row[name]) for row in rows] for name in (rows[0] if rows else ())}
 
     def distributions(self) -> dict[str, list[list[float]]]:
         """Histograms as [value, count], in order of value: logarithmic buckets 4 % wide."""
@@ -496,11 +457,6 @@ class Recorder:
             {"t_s": round(time_s, 3), "from": f"{note.role} {note.id}", "kind": note.kind, "text": note.text}
             for time_s, note in self.notes
         ]
-
-    def _gap(self) -> dict[str, float | None]:
-        """Driven cost over optimum, as the planners measured it."""
-        gap = of_excess(self.observed.histogram("gap_excess"))
-        return gap if self._gap_max is None else {**gap, "max": self._gap_max}
 
 
 def _track(tracks: Thinned[Sampling], now_ns: int, keys: Iterable[TrackKey], places_m: NDArray[np.float32]) -> None:
@@ -525,9 +481,10 @@ def quantiles(histogram: Histogram) -> dict[str, float | None]:
     return {"p50": histogram.quantile(0.5), "p99": histogram.quantile(0.99)}
 
 
-def _mean(values: Iterable[float]) -> float | None:
-    kept = list(values)
-    return sum(kept) / len(kept) if kept else None
+def _mean(values: Iterable[float | None]) -> float | None:
+    """Returns the mean of known values; None if there are none."""
+    known = [value for value in values if value is not None]
+    return sum(known) / len(known) if known else None
 
 
 def _rounded(value: Any) -> Any:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -56,7 +56,7 @@ def _that_differ(runs: Sequence[Mapping[str, Any] | None]) -> list[Row]:
     return [
         (key, [None if each is None else each.get(key) for each in runs])
         for key in dict.fromkeys(key for each in known for key in each)
-        if _differ(each.get(key) for each in known)
+        if any(each.get(key) != known[0].get(key) for each in known)
     ]
 
 
@@ -68,13 +68,11 @@ def figures(runs: Sequence[LeftRun], labels: Mapping[str, str]) -> list[Row]:
     told: list[dict[str, Any]] = []
     for report in (run.report for run in runs):
         named = _flat({label: report.get(name) for name, label in labels.items()}, "")
+        groups, targets = _table(report.get("by_group")), _table(report.get("by_target"))
         told.append(
             {key.replace(".", ", "): value for key, value in named}
-            | {label: _sum(report.get("by_group"), name) for name, label in _SUMMED.items()}
-            | {
-                f"captures of {id}": _table(row).get("captures")
-                for id, row in _table(report.get("by_target")).items()
-            }
+            | {label: _sum(groups, name) for name, label in _SUMMED.items()}
+            | {f"captures of {id}": _table(row).get("captures") for id, row in targets.items()}
         )
     rows = [(key, [each.get(key) for each in told]) for key in dict.fromkeys(key for each in told for key in each)]
     return [row for row in rows if any(value is not None for value in row[1])]
@@ -103,16 +101,10 @@ def _flat(value: Any, path: str) -> Iterator[tuple[str, Any]]:
         yield path, value
 
 
-def _differ(values: Iterable[Any]) -> bool:
-    first, *others = values
-    return any(value != first for value in others)
-
-
 def _table(value: Any) -> Mapping[str, Any]:
     return value if isinstance(value, Mapping) else {}
 
 
-def _sum(by_group: Any, name: str) -> float | None:
-    values = [row.get(name) for row in _table(by_group).values() if isinstance(row, Mapping)]
-    numbers = [value for value in values if isinstance(value, int | float)]
+def _sum(groups: Mapping[str, Any], name: str) -> float | None:
+    numbers = [value for row in groups.values() if isinstance(value := _table(row).get(name), int | float)]
     return sum(numbers) if numbers else None

@@ -23,7 +23,7 @@ from dataclasses import dataclass, field
 from functools import lru_cache
 from importlib.metadata import version
 from pathlib import Path
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -84,29 +84,12 @@ class Layer:
         return f"{self.about} {'; '.join(fields)}.".strip(" .") + "." if self.about else ""
 
 
-class Format(NamedTuple):
-    """One row of `FORMATS`.
-
-    driver   of GDAL; empty: `_write_csv`
-    degrees  places are longitudes and latitudes, where the terrain has a place
-    local    places may be metres of a map without a place on Earth
-    many     a file holds several layers
-    """
-
-    driver: str
-    degrees: bool
-    local: bool
-    many: bool
-
-
-FORMATS: Mapping[str, Format] = {
-    ".geojson": Format("GeoJSON", degrees=True, local=True, many=False),
-    ".gpkg": Format("GPKG", degrees=False, local=True, many=True),
-    ".kml": Format("LIBKML", degrees=True, local=False, many=True),
-    ".gpx": Format("GPX", degrees=True, local=False, many=False),
-    ".csv": Format("", degrees=True, local=True, many=False),
-}
-"""Ending -> format of layers."""
+FORMATS: Mapping[str, str] = {".geojson": "GeoJSON", ".gpkg": "GPKG", ".kml": "LIBKML", ".gpx": "GPX", ".csv": ""}
+"""Ending -> GDAL's driver of layers; none: `_write_csv`."""
+SEVERAL = (".gpkg", ".kml")
+"""Endings of the formats of which a file holds several layers."""
+_ON_EARTH = (".kml", ".gpx")
+"""Endings of the formats whose places are always longitudes and latitudes."""
 AREAS = tuple(ending for ending in FORMATS if ending != ".gpx")
 """Endings of the formats which have areas."""
 TIFF = (".tif", ".tiff")
@@ -143,46 +126,58 @@ def write_layers(path: Path, layers: Sequence[Layer], frame: MapFrame) -> None:
         If the file cannot be written.
     """
     check_target(path, "--out", *FORMATS, force=True)
-    form = FORMATS[path.suffix.lower()]
-    placed = frame.grid.crs != "local"
-    if not placed and not form.local:
+    ending, placed = path.suffix.lower(), frame.grid.crs != "local"
+    driver = FORMATS[ending]
+    if not placed and ending in _ON_EARTH:
         raise ConfigError(f"--out {path}: the terrain has no place on Earth; write .csv, .geojson or .gpkg")
-    if path.suffix.lower() not in AREAS and any(layer.shape == "Polygon" for layer in layers):
-        raise ConfigError(f"--out {path}: {form.driver} has no areas; write {' or '.join(AREAS)}")
+    if ending not in AREAS and any(layer.shape == "Polygon" for layer in layers):
+        raise ConfigError(f"--out {path}: {driver} has no areas; write {' or '.join(AREAS)}")
     with replacing(path) as half:
-        if not form.driver:
+        if not driver:
             _write_csv(half, layers[0], frame)
             return
-        extra = map(_places_of, filter(_is_timed, layers)) if form.driver == "GPKG" else ()
+        extra = map(_places_of, filter(_is_timed, layers)) if driver == "GPKG" else ()
         for number, layer in enumerate([*layers, *extra]):
-            _write_layer(half, layer, frame, form, append=number > 0)
+            _write_layer(half, layer, frame, driver, append=number > 0)
 
 
 # --- by GDAL ------------------------------------------------------------------------------------------------------
 
+_TYPES: Mapping[FieldKind, Any] = {
+    "text": object, "json": object, "int": np.int64, "flag": np.int32, "real": np.float64, "time": "datetime64[ms]"
+}  # fmt: skip
 
-def _write_layer(path: Path, layer: Layer, frame: MapFrame, form: Format, append: bool) -> None:
+
+def _write_layer(path: Path, layer: Layer, frame: MapFrame, driver: str, append: bool) -> None:
     import shapely
     from pyogrio import raw
     from pyogrio.errors import DataLayerError, DataSourceError
 
-    degrees = form.degrees and frame.grid.crs != "local"
-    options, more = {"DESCRIPTION": layer.described() or layer.name}, dict[str, tuple[FieldKind, Value]]()
-    match form.driver:
+    placed, crs = frame.grid.crs != "local", None
+    kinds, options = dict[str, FieldKind](), {"DESCRIPTION": layer.described() or layer.name}
+    match driver:
         case "GeoJSON":
-            more = {"layer": ("text", layer.name), **({"times": ("json", None)} if _is_timed(layer) else {})}
-            options["COORDINATE_PRECISION"] = "8" if degrees else "3"
+            kinds = {"layer": "text", **({"times": "json"} if _is_timed(layer) else {})}
+            options["COORDINATE_PRECISION"] = "8" if placed else "3"
         case "LIBKML":
-            more, options = {"tessellate": ("flag", 1), "altitudeMode": ("text", "clampToGround")}, {}
+            kinds, options, crs = {"tessellate": "flag", "altitudeMode": "text"}, {}, "EPSG:4326"
         case "GPX":
-            layer, options = _gpx_points(layer), {}
-    fields = {name: kind for name, (kind, _) in more.items()} | dict(layer.fields)
-    columns = [_column(layer, name, kind, more.get(name, ("text", None))[1]) for name, kind in fields.items()]
-    shapes = _shapes(layer, frame, degrees)
+            layer, options, crs = _gpx_points(layer), {}, "EPSG:4326"
+        case "GPKG" if placed:
+            crs = named_system(frame)
+    kinds |= layer.fields
+    constant = {"layer": layer.name, "tessellate": 1, "altitudeMode": "clampToGround"}
+    values: dict[str, list[Any]] = {
+        name: [each.values.get(name, constant.get(name)) for each in layer.features] for name in kinds
+    }
+    if "times" in kinds:
+        values["times"] = [
+            None if each.time_ns is None else [*map(iso_time, each.time_ns)] for each in layer.features
+        ]
+    for name in (name for name, kind in kinds.items() if kind == "json"):
+        # GDAL writes a text which is JSON as JSON into GeoJSON.
+        values[name] = [None if value is None else json.dumps(value) for value in values[name]]
     high = any(part.shape[1] == 3 for feature in layer.features for part in feature.parts)
-    crs = "EPSG:4326" if form.driver in ("LIBKML", "GPX") else None
-    if form.driver == "GPKG" and frame.grid.crs != "local":
-        crs = named_system(frame)
     try:
         with warnings.catch_warnings():
             # RFC 7946 has no system to name, nor has a site; GPX ends at 180 degrees, and begins at -180.
@@ -190,19 +185,22 @@ def _write_layer(path: Path, layer: Layer, frame: MapFrame, form: Format, append
             raw.write(
                 path,
                 # Borders against the clock, holes with it, as RFC 7946 has it.
-                shapely.to_wkb(shapely.orient_polygons(shapes), output_dimension=3 if high else 2),
-                columns,
-                list(fields),
+                shapely.to_wkb(
+                    shapely.orient_polygons(_shapes(layer, frame, placed and driver != "GPKG")),
+                    output_dimension=3 if high else 2,
+                ),
+                [np.array(values[name], _TYPES[kind]) for name, kind in kinds.items()],
+                list(kinds),
                 layer=layer.name,
-                driver=form.driver,
+                driver=driver,
                 geometry_type=f"{layer.shape} Z" if high else layer.shape,
                 crs=crs,
                 append=append,
                 layer_options=options,
                 # QGIS and ArcGIS of before 2020 open no newer one.
-                dataset_options={"VERSION": "1.2"} if form.driver == "GPKG" and not append else {},
+                dataset_options={"VERSION": "1.2"} if driver == "GPKG" and not append else {},
                 gdal_tz_offsets={  # 100 is UTC
-                    name: np.full(len(layer.features), 100) for name, kind in fields.items() if kind == "time"
+                    name: np.full(len(layer.features), 100) for name, kind in kinds.items() if kind == "time"
                 },
             )
     except (DataSourceError, DataLayerError) as error:
@@ -215,19 +213,14 @@ def _shapes(layer: Layer, frame: MapFrame, degrees: bool) -> NDArray[Any]:
 
     shapes = np.empty(len(layer.features), object)
     for n, feature in enumerate(layer.features):
-        parts = [_placed(part, frame) for part in feature.parts] if degrees else feature.parts
+        parts = [in_degrees(part, frame) for part in feature.parts] if degrees else feature.parts
         if not all(np.isfinite(part[:, :2]).all() for part in parts):
             raise StoreError(
                 f"cannot write the layer {layer.name}: a place has no longitude and latitude in "
                 f"{frame.grid.crs[:60]}; write a .gpkg, which is in metres of the map"
             )
-        match layer.shape:
-            case "Point":
-                shapes[n] = shapely.Point(parts[0][0])
-            case "LineString":
-                shapes[n] = shapely.LineString(parts[0])
-            case "Polygon":
-                shapes[n] = shapely.Polygon(parts[0], parts[1:])
+        holes = [parts[1:]] if layer.shape == "Polygon" else []
+        shapes[n] = getattr(shapely, layer.shape)(parts[0], *holes)
     return shapes
 
 
@@ -239,11 +232,10 @@ def _gpx_points(layer: Layer) -> Layer:
     """The points of a layer as GDAL's GPX driver wants them: of lines their track points, of points waypoints."""
     names = [str(each.values.get("name") or next(iter(each.values.values()), "")) for each in layer.features]
     if layer.shape == "Point":
-        features = [
+        return Layer("waypoints", "Point", {"name": "text", "time": "time"}, [
             Feature(each.parts, {"name": name, "time": each.values.get("at", each.values.get("begins"))})
             for each, name in zip(layer.features, names, strict=True)
-        ]
-        return Layer("waypoints", "Point", {"name": "text", "time": "time"}, features)
+        ])  # fmt: skip
     fields: dict[str, FieldKind] = {
         "track_fid": "int", "track_seg_id": "int", "track_name": "text", "ele": "real", "time": "time",
     }  # fmt: skip
@@ -265,26 +257,11 @@ def _points_of(layer: Layer) -> Iterator[tuple[int, Feature, Points, np.datetime
 
 def _places_of(layer: Layer) -> Layer:
     """The points of a layer of lines, each with its time: what a GIS plays back."""
-    own = [name for name in layer.fields if name not in TIMED]
-    fields: dict[str, FieldKind] = {**{name: layer.fields[name] for name in own}, "at": "time"}
-    return Layer(layer.name.replace("_tracks", "_places"), "Point", fields, [
+    own = {name: kind for name, kind in layer.fields.items() if name not in TIMED}
+    return Layer(layer.name.replace("_tracks", "_places"), "Point", {**own, "at": "time"}, [
         Feature([place], {**{name: line.values[name] for name in own}, "at": time})
         for _, line, place, time in _points_of(layer)
     ])  # fmt: skip
-
-
-_TYPES: Mapping[FieldKind, Any] = {
-    "text": object, "json": object, "int": np.int64, "flag": np.int32, "real": np.float64, "time": "datetime64[ms]"
-}  # fmt: skip
-
-
-def _column(layer: Layer, name: str, kind: FieldKind, default: Value) -> NDArray[Any]:
-    values: list[Any] = [feature.values.get(name, default) for feature in layer.features]
-    if name == "times":
-        values = [None if each.time_ns is None else list(map(iso_time, each.time_ns)) for each in layer.features]
-    if kind == "json":  # GDAL writes a text which is JSON as JSON into GeoJSON
-        values = [None if value is None else json.dumps(value) for value in values]
-    return np.array(values, _TYPES[kind])
 
 
 # --- as a table ---------------------------------------------------------------------------------------------------
@@ -303,18 +280,20 @@ def _write_csv(path: Path, layer: Layer, frame: MapFrame) -> None:
         names, where = ["wkt"], [[text] for text in texts]
     else:
         points = np.concatenate([np.empty((0, 2)), *(each.parts[0][:, :2] for each in layer.features)])
-        degrees = _placed(points, frame)[:, ::-1].round(8) if placed else np.empty((len(points), 0))
+        degrees = in_degrees(points, frame)[:, ::-1].round(8) if placed else np.empty((len(points), 0))
         names = ["x_m", "y_m", *(["lat", "lon"] if placed else [])]
         where = [[*xy, *lat_lon] for xy, lat_lon in zip(points.round(3).tolist(), degrees.tolist(), strict=True)]
     with path.open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
         writer.writerow([*layer.fields, *names])
         for feature, place in zip(layer.features, where, strict=True):
-            writer.writerow([*(_cell(feature.values[name]) for name in layer.fields), *place])
-
-
-def _cell(value: Value) -> Any:
-    return json.dumps(value) if isinstance(value, list | dict) else iso_time(value)
+            values = [feature.values[name] for name in layer.fields]
+            writer.writerow(
+                [
+                    *(json.dumps(each) if isinstance(each, list | dict) else iso_time(each) for each in values),
+                    *place,
+                ]
+            )
 
 
 # --- values and shapes --------------------------------------------------------------------------------------------
@@ -335,9 +314,10 @@ def iso_time(value: Any) -> Any:
 
 
 def in_degrees(points: Points, frame: MapFrame) -> Points:
-    """Longitudes and latitudes of points of the map; without a jump where the map crosses 180 degrees."""
+    """Longitudes and latitudes of points of the map, with their heights where they have some; without a jump where
+    the map crosses 180 degrees."""
     lat, lon = frame.to_degrees(points[:, 0], points[:, 1])
-    return np.stack([np.where(lon < _least_lon(frame), lon + 360.0, lon), lat], axis=1)
+    return np.column_stack([np.where(lon < _least_lon(frame), lon + 360.0, lon), lat, points[:, 2:]])
 
 
 @lru_cache(4)
@@ -347,11 +327,6 @@ def _least_lon(frame: MapFrame) -> float:
 
     box = bounds_of(frame)
     return -360.0 if box is None or box[3] <= 180.0 else 0.0
-
-
-def _placed(points: Points, frame: MapFrame) -> Points:
-    """`in_degrees`, with heights where there are some."""
-    return np.concatenate([in_degrees(points, frame), points[:, 2:]], axis=1)
 
 
 def areas_of(

@@ -42,7 +42,7 @@ from launch_scripts.observe.palette import GROUPS, colours_of_groups, rgb
 from launch_scripts.observe.run_alarms import Alarm
 from launch_scripts.observe.run_folder import REPORT_FILE, read_report
 from launch_scripts.report.gis_formats import turns_of
-from launch_scripts.report.npz_files import GROUND_PACE_FILE, GroundPace, RunTracks, Track, read_ground
+from launch_scripts.report.report_and_tracks import GROUND_PACE_FILE, GroundPace, RunTracks, Track, read_ground
 from launch_scripts.report.run_gis_layers import free_places, groups_of, tracks_of_run
 from shared_map.terrain.map_frame import middles_of
 from swarm.clock import NS_PER_S

@@ -1,4 +1,4 @@
-"""Plots and cards, made from a report: one table for the picture and for the page of a run; and a study's outcomes.
+"""Plots and cards, made from a report: one table for the picture and for the page of a run.
 
 A plot is one row of `PLOTS`. It names what it shows of the report, and is drawn in one of three ways: courses over
 time, states of all vehicles in a stack, or the share of all that is at most so large.
@@ -50,7 +50,6 @@ class Plot:
     of         the plotted value of the report
     tick       a shown value in words
     least      the vertical axis ends there at least
-    over_time  whether the horizontal axis is the run's seconds; else it is a value
     """
 
     name: str
@@ -62,10 +61,6 @@ class Plot:
     tick: Callable[[float], str] = lambda value: f"{value / 1000:g}k" if abs(value) >= 1000 else f"{value:g}"
     least: float = 1.0
 
-    @property
-    def over_time(self) -> bool:
-        return self.draw is not _shares
-
 
 def draw_plot(axes: Axes, plot: Plot, report: Report, *, titled: bool = True) -> None:
     """Draws one plot and its axes."""
@@ -76,24 +71,17 @@ def draw_plot(axes: Axes, plot: Plot, report: Report, *, titled: bool = True) ->
         axes.text(0.5, 0.5, "not measured", transform=axes.transAxes, ha="center", va="center", color=palette.FAINT)
         axes.set(xticks=[], yticks=[])
         return
-    if plot.over_time:
+    over_time = plot.draw is not _shares
+    if over_time:
         axes.set_xlim(0, max(report["series"]["t_s"], default=1.0) or 1.0)
         axes.xaxis.set_major_locator(MaxNLocator(6))
         axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: f"{value:g} s" if value else "0"))
-        axes.yaxis.set_major_locator(MaxNLocator(4))
+        axes.yaxis.set_major_locator(MaxNLocator(4, integer=plot.tick not in (_percent, _ms)))
     axes.tick_params(axis="both", which="both", length=0)
-    of_values = axes.yaxis if plot.over_time else axes.xaxis
+    of_values = axes.yaxis if over_time else axes.xaxis
     of_values.set_major_formatter(FuncFormatter(lambda value, _: plot.tick(value) if value else "0"))
     if len(plot.lines) > 1:
         _legend_above(axes)
-
-
-def series_of(report: Report, name: str) -> tuple[Values, Values]:
-    """Times and values of a series, where there are values."""
-    series = report.get("series", {})
-    pairs = [(t, v) for t, v in zip(series.get("t_s", []), series.get(name, []), strict=False) if v is not None]
-    times, values = np.array(pairs, np.float64).reshape(-1, 2).T
-    return times, values
 
 
 def _states(axes: Axes, plot: Plot, report: Report) -> bool:
@@ -110,11 +98,13 @@ def _states(axes: Axes, plot: Plot, report: Report) -> bool:
 def _courses(axes: Axes, plot: Plot, report: Report) -> bool:
     """Series over time, the area below the first filled."""
     most, drawn = plot.least, False
+    series = report.get("series", {})
     for number, (name, (label, colour)) in enumerate(plot.lines.items()):
-        times, values = series_of(report, name)
-        if not len(values):
+        both = zip(series.get("t_s", []), series.get(name, []), strict=False)
+        known = np.array([(time, value) for time, value in both if value is not None], np.float64)
+        if not len(known):
             continue
-        shown, drawn = plot.of(values), True
+        times, shown, drawn = known[:, 0], plot.of(known[:, 1]), True
         axes.plot(times, shown, "--" if number else "-", color=colour, linewidth=1.7, label=label)
         axes.fill_between(times, shown, color=colour, alpha=0.0 if number else 0.25, linewidth=0)
         most = max(most, 1.1 * float(shown.max()))

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from launch_scripts.observe.run_folder import REPORT_FILE, lacks, read_report
 from launch_scripts.report import gis_formats as gis
 from launch_scripts.report.gis_formats import Feature, Layer
-from launch_scripts.report.npz_files import TRACKS_FILE, RunTracks, Track, read_tracks
+from launch_scripts.report.report_and_tracks import TRACKS_FILE, RunTracks, Track, read_tracks
 from shared_map.terrain.map_frame import MapFrame, middles_of
 from swarm.errors import ConfigError
 from swarm.files import make_folder
@@ -44,19 +44,19 @@ def _moved(lines: Layer, tracks: Sequence[tuple[Track, dict[str, gis.Value]]]) -
     for track, whose in tracks:
         if not len(track.time_ns):
             continue
-        steps_m = np.hypot(*np.diff(track.xy_m, axis=0).T)
-        values: dict[str, gis.Value] = {
-            **whose,
-            "begins": gis.moment(track.time_ns[0]),
-            "ends": gis.moment(track.time_ns[-1]),
-            "samples": len(track.time_ns),
-            "length_m": round(float(steps_m.sum()), 2),
-        }
-        if values["length_m"] == 0:
+        length_m = _length_m(track.xy_m)
+        begins, ends = (gis.moment(track.time_ns[n]) for n in (0, -1))
+        told: tuple[gis.Value, ...] = (begins, ends, len(track.time_ns), length_m)
+        values = {**whose, **dict(zip(gis.TIMED, told, strict=True))}
+        if length_m == 0:
             points.features.append(Feature([track.xy_m[:1]], values))
         else:
             lines.features.append(Feature([track.xy_m], values, track.time_ns))
     return [lines, points] if points.features else [lines]
+
+
+def _length_m(xy_m: gis.Points) -> float:
+    return round(float(np.hypot(*np.diff(xy_m, axis=0).T).sum()), 2)
 
 
 def _captures(tracks: RunTracks, groups: Groups) -> list[Layer]:
@@ -70,25 +70,17 @@ def _captures(tracks: RunTracks, groups: Groups) -> list[Layer]:
 def _routes(tracks: RunTracks, groups: Groups) -> list[Layer]:
     """The routes that vehicles began: over the middles of cells, straight on where they go straight on. One that
     stays in its cell is none."""
-    grid = tracks.grid
     layer = Layer(
         "routes", "LineString",
         {"vehicle": "text", "target": "text", "at": "time", "cost_s": "real", "certified_gap": "real",
          "length_m": "real"}, about=gis.COSTS,
     )  # fmt: skip
     for route in tracks.routes:
-        x_m, y_m = middles_of(grid, gis.turns_of(route.cells, grid))
-        length_m = float(np.hypot(np.diff(x_m), np.diff(y_m)).sum())
-        if length_m > 0:
-            values: dict[str, gis.Value] = {
-                "vehicle": route.vehicle,
-                "target": route.target,
-                "at": gis.moment(np.int64(route.time_ns)),
-                "cost_s": route.cost_s,
-                "certified_gap": route.gap if math.isfinite(route.gap) else None,
-                "length_m": round(length_m, 2),
-            }
-            layer.features.append(Feature([np.stack([x_m, y_m], axis=1)], values))
+        xy_m = middles_of(tracks.grid, gis.turns_of(route.cells, tracks.grid)).T
+        if (length_m := _length_m(xy_m)) > 0:
+            at, gap = gis.moment(np.int64(route.time_ns)), route.gap if math.isfinite(route.gap) else None
+            told = (route.vehicle, route.target, at, route.cost_s, gap, length_m)
+            layer.features.append(Feature([xy_m], dict(zip(layer.fields, told, strict=True))))
     return [layer]
 
 
@@ -119,13 +111,9 @@ def mark_layer(grid: GridSpec, kinds: NDArray[np.uint8], paces: NDArray[np.float
     for code, rings in gis.areas_of(codes, codes > 0, grid):
         border_m2, *holes_m2 = map(_enclosed_m2, rings)
         area_m2 = border_m2 - sum(holes_m2)
-        values: dict[str, gis.Value] = {
-            "kind": "lethal" if code == 1 else "pace",
-            "pace_s_per_m": None if code == 1 else float(f"{rounded[code - 2]:.4g}"),
-            "cells": round(area_m2 / grid.resolution_m**2),
-            "area_m2": round(area_m2, 3),
-        }
-        layer.features.append(Feature(rings, values))
+        kind, pace = ("lethal", None) if code == 1 else ("pace", float(f"{rounded[code - 2]:.4g}"))
+        told = (kind, pace, round(area_m2 / grid.resolution_m**2), round(area_m2, 3))
+        layer.features.append(Feature(rings, dict(zip(layer.fields, told, strict=True))))
     return layer
 
 
@@ -162,17 +150,17 @@ def export_run(folder: Path, what: Sequence[str], format: str, out: Path | None,
     groups = groups_of(read_report(folder)) if (folder / REPORT_FILE).exists() else {}
     names = what or [name for name in WHAT if name != "marks" or f".{format}" in gis.AREAS]
     layers = [layer for name in WHAT if name in names for layer in WHAT[name](tracks, groups)]
-    frame, run = MapFrame(tracks.grid), folder.resolve().name
-    if gis.FORMATS[f".{format}"].many:
+    run = folder.resolve().name
+    if f".{format}" in gis.SEVERAL:
         files = {f"{run}.{format}": layers}
     else:
         files = {f"{run}-{layer.name}.{format}": [layer] for layer in layers}
-    where = free_places(folder, list(files), out, force)
-    for path, some in zip(where, files.values(), strict=True):
-        gis.write_layers(path, some, frame)
+    written = dict(zip(free_places(folder, list(files), out, force), files.values(), strict=True))
+    for path, some in written.items():
+        gis.write_layers(path, some, MapFrame(tracks.grid))
     return [
         f"{path}: {', '.join(f'{len(layer.features):,} {layer.name}' for layer in some)}"
-        for path, some in zip(where, files.values(), strict=True)
+        for path, some in written.items()
     ]
 
 
@@ -203,6 +191,5 @@ def free_places(folder: Path, names: Sequence[str], out: Path | None, force: boo
 def groups_of(report: Mapping[str, Any]) -> dict[str, str]:
     """Vehicle -> its group, by a report, which may be damaged."""
     rows = report.get("by_vehicle")
-    if not isinstance(rows, dict):
-        return {}
-    return {id: str(row["group"]) for id, row in rows.items() if isinstance(row, dict) and "group" in row}
+    named = rows.items() if isinstance(rows, dict) else ()
+    return {id: str(row["group"]) for id, row in named if isinstance(row, dict) and "group" in row}

@@ -1,4 +1,4 @@
-"""Figures of a terrain: heights, photo, classes and cost; a route on its relief; rules by which slope becomes pace.
+"""Figures of a terrain: heights, photo, classes and cost; a route on its relief.
 
 A map is values of each cell of a level in colours, drawn by matplotlib, with the relief as a shadow over them.
 """

@@ -10,7 +10,7 @@ import pytest
 from support.live_swarm import SWARM, folders_of_runs
 from support.processes import eventually, session_of
 
-from launch_scripts.report.npz_files import TRACKS_FILE, read_tracks
+from launch_scripts.report.report_and_tracks import TRACKS_FILE, read_tracks
 
 pytestmark = [pytest.mark.network, pytest.mark.slow]
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 from launch_scripts.observe.run_recorder import Recorder
-from launch_scripts.report.report_json import make_report, write_report
+from launch_scripts.report.report_and_tracks import make_report, write_report
 from launch_scripts.simulation.simulate import Simulation
 from launch_scripts.simulation.simulated_process import EPOCH_NS as BEGAN_NS
 from shared_map.array_files import Floats
@@ -48,7 +48,7 @@ def leave(folder: Path, recorder: Recorder, terrain: Terrain, truth: Floats) -> 
     """Writes what a run leaves into a new folder, but an empty picture: that is another test's."""
     folder.mkdir(exist_ok=True)
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr("launch_scripts.report.run_picture.save_picture", lambda half, *_: half.touch())
+        patched.setattr("launch_scripts.report.run_page_and_map.save_picture", lambda half, *_: half.touch())
         write_report(folder, make_report(recorder, terrain, run_id="r1"), recorder, terrain, truth=truth)
 
 

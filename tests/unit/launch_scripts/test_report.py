@@ -1,6 +1,7 @@
 """The results of a run: its folder, its numbers, which add up, and its picture."""
 
 import csv
+import dataclasses
 import json
 import re
 from pathlib import Path
@@ -10,7 +11,6 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 from matplotlib.image import imread
-from numpy.typing import NDArray
 from support import fake_run
 
 from launch_scripts.launcher.run_options import SCENARIOS, find_scenario
@@ -19,8 +19,8 @@ from launch_scripts.observe.latest_messages import VehicleColumns
 from launch_scripts.observe.run_folder import begin_run, ended, find_run, point_last, read_report
 from launch_scripts.observe.run_recorder import Driven, Recorder
 from launch_scripts.report import plots_and_cards as plots
-from launch_scripts.report import run_picture as picture
-from launch_scripts.report.report_json import TABLES, make_report, write_report
+from launch_scripts.report import run_page_and_map as picture
+from launch_scripts.report.report_and_tracks import TABLES, make_report, read_tracks, write_report
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.clock import NS_PER_S
 from swarm.config.load import load_scenario, parse_scenario
@@ -63,8 +63,7 @@ def test_the_report_has_every_number_that_was_asked_for(left: tuple[Path, Record
     report = json.loads((folder / "report.json").read_text())
     assert report["ground_shows"] == ["hidden"]
     assert [name for name in ASKED_FOR if report.get(name) is None] == []
-    assert report["startup_s"] == 1.5
-    assert report["restarts"] == 0
+    assert (report["startup_s"], report["restarts"]) == (1.5, 0)
     assert report["marks"] == report["marked_cells"] > 0
     assert report["vehicles_routed"] == 10
     outcome = r"10 of 10 vehicles routed, (no|\d+) captures?, no collisions\. All went well\."
@@ -83,6 +82,15 @@ def test_the_report_has_every_number_that_was_asked_for(left: tuple[Path, Record
         "ground.npz", "ground.webp", "groups.csv", "report.html", "report.json", "report.png", "run.json",
         "scenario.toml", "targets.csv", "tracks.npz", "vehicles.csv",
     ]  # fmt: skip
+
+
+def test_a_target_at_the_upper_border_has_its_name_below_it_also_without_marks(left: tuple[Path, Recorder]) -> None:
+    tracks = read_tracks(left[0] / "tracks.npz")
+    top = dataclasses.replace(tracks.vehicles[0], xy_m=np.array([[9.0, -1.0]]))
+    no_marks = tracks.marks._make(column[:0] for column in tracks.marks)
+    axes = Figure().add_subplot()
+    picture.draw_map(axes, dataclasses.replace(tracks, targets=[top], marks=no_marks), {})
+    assert axes.texts[0].get_verticalalignment() == "top"
 
 
 def test_a_run_of_which_nothing_was_heard_still_leaves_a_report(tmp_path: Path) -> None:
@@ -204,28 +212,23 @@ def test_results_per_target_group_and_vehicle_add_up_to_those_of_the_run(left: t
         rows = report[section].values()
         assert sum(row["captures"] for row in rows) == report["captures"], section
         assert sum(row["routes"] for row in rows) == proven, section
-        assert (
-            max(row["certified_gap"]["max"] for row in rows if row["routes"]) == report["certified_gap"]["max"]
-        ), section
-    vehicles = report["by_vehicle"]
+        assert max(row["certified_gap"]["max"] for row in rows if row["routes"]) == report["certified_gap"]["max"]
     for name, group in report["by_group"].items():
-        own = [row for row in vehicles.values() if row["group"] == name]
+        own = [row for row in report["by_vehicle"].values() if row["group"] == name]
         assert group["vehicles"] == len(own)
         assert group["distance_m"] == pytest.approx(sum(row["distance_m"] for row in own), rel=1e-4)
     assert {name: group["vehicles"] for name, group in report["by_group"].items()} == {"north": 6, "south": 4}
     assert report["made"]["began"] <= report["made"]["ended"]
     summary = recorder.summary(recorder.observed.last_ns or 0)
-    assert {line.id: line.captures for line in summary.targets} == {
-        id: row["captures"] for id, row in report["by_target"].items()
-    }
+    caught = {id: row["captures"] for id, row in report["by_target"].items()}
+    assert {line.id: line.captures for line in summary.targets} == caught
     assert summary.certified_gap.mean == pytest.approx(report["certified_gap"]["mean"], rel=1e-5)
 
 
 def test_the_tables_are_those_of_the_report(left: tuple[Path, Recorder]) -> None:
-    folder, _ = left
-    report = json.loads((folder / "report.json").read_text())
+    report = read_report(left[0])
     for section, (file, what) in TABLES.items():
-        rows = list(csv.DictReader((folder / file).read_text().splitlines()))
+        rows = list(csv.DictReader((left[0] / file).read_text().splitlines()))
         assert [row[what] for row in rows] == list(report[section])
         for row in rows:
             told = report[section][row[what]]
@@ -235,8 +238,7 @@ def test_the_tables_are_those_of_the_report(left: tuple[Path, Recorder]) -> None
 
 def columns(ids: list[str], places: list[float], states: list[VehicleState]) -> VehicleColumns:
     east_m = np.array(places, np.float32)
-    none: NDArray[np.int64] = np.full(len(ids), -1, np.int64)
-    return VehicleColumns(ids, east_m, np.zeros_like(east_m), np.array(states, np.uint8), none, [])
+    return VehicleColumns(ids, east_m, 0 * east_m, np.array(states, np.uint8), np.full(len(ids), -1), [])
 
 
 def test_distance_and_waiting_are_those_of_each_vehicle_also_of_one_that_comes_later_or_leaves() -> None:

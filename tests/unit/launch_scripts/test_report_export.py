@@ -21,9 +21,9 @@ from support.command import Swarm
 from support.fake_run import BEGAN_NS, little_scenario, played
 from support.map_strategies import set_of
 
-from launch_scripts.observe.run_recorder import BegunRoute, Recorder, tracks_of
+from launch_scripts.observe.run_recorder import BegunRoute, Recorder
 from launch_scripts.report.gis_formats import in_degrees, write_layers
-from launch_scripts.report.npz_files import TRACKS_FILE, Track, packed_tracks, read_tracks, tracks_in
+from launch_scripts.report.report_and_tracks import TRACKS_FILE, Track, packed_tracks, read_tracks, tracks_in
 from launch_scripts.report.run_gis_layers import ENDINGS, mark_layer, target_tracks, vehicle_tracks
 from shared_map.keeper.mark_store import KeeperStore
 from shared_map.terrain.map_frame import MapFrame
@@ -74,17 +74,18 @@ def test_geojson_has_places_and_times_in_wgs84(run: Path, recorder: Recorder, tm
     assert (code, "4 vehicle_tracks" in out) == (0, True)
     layers = read_layers(tmp_path)
     assert len(layers["captures"]) == len(recorder.captures) > 0
-    lines = tracks_of(recorder.vehicle_tracks.kept)
     for feature in layers["vehicle_tracks"]:
         said = feature["properties"]
         points = np.array(feature["geometry"]["coordinates"])
-        east_m, south_m = lines[said["vehicle"], 0][1][[0, -1]].astype(float).T
+        key = said["vehicle"], 0
+        first, *_, last = (each for each in recorder.vehicle_tracks.kept if key in each.keys)
+        east_m, south_m = np.array([each.places_m[each.keys.index(key)] for each in (first, last)], float).T
         xy_m = np.stack([GRID.west_m + east_m, GRID.north_m - south_m], axis=1)
         assert points[[0, -1]] == pytest.approx(in_degrees(xy_m, MapFrame(GRID)), abs=1e-7)
         times = [datetime.datetime.fromisoformat(time) for time in said["times"]]
         assert len(times) == len(points) <= said["samples"]
         assert times == sorted(times)
-        assert times[0].timestamp() * NS_PER_S == pytest.approx(lines[said["vehicle"], 0][0][0])
+        assert times[0].timestamp() * NS_PER_S == pytest.approx(first.time_ns)
     marked = recorder.observed.marked()
     assert sum(each["properties"]["cells"] for each in layers["marks"]) == len(marked.cells) > 0
     lethal = sum(each["properties"]["cells"] for each in layers["marks"] if each["properties"]["kind"] == "lethal")

@@ -24,7 +24,7 @@ from support.fake_run import BEGAN_NS, leave, little_scenario, played
 from launch_scripts.gateways.ros2.ros_messages import RosMap, ros_name
 from launch_scripts.observe.summed_counts import percent
 from launch_scripts.report.mcap_export import export_mcap, frame_names, instants_of, lines_of
-from launch_scripts.report.npz_files import GROUND_PACE_FILE, TRACKS_FILE, RunTracks, read_tracks
+from launch_scripts.report.report_and_tracks import GROUND_PACE_FILE, TRACKS_FILE, RunTracks, read_tracks
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.clock import NS_PER_S
 from swarm.config.write import scenario_text

@@ -15,7 +15,7 @@ from support.map_strategies import set_of
 from launch_scripts.launcher.terminal_tables import plain_line
 from launch_scripts.observe import fact_table as facts
 from launch_scripts.observe.latest_messages import LatestState, plan_of
-from launch_scripts.observe.run_recorder import BegunRoute, Recorder, Sampling, Thinned, tracks_of
+from launch_scripts.observe.run_recorder import BegunRoute, Recorder, Sampling, Thinned
 from launch_scripts.observe.summed_counts import CertifiedGap
 from swarm.clock import NS_PER_S
 from swarm.config.load import parse_scenario
@@ -268,9 +268,8 @@ def test_a_capture_is_placed_where_the_target_was_though_nobody_tracks_it(record
 def test_a_jump_begins_a_new_piece_of_a_targets_track(recorder: Recorder) -> None:
     for n in range(4):
         hear(recorder, pose("t0", 100.0 + n, 200.0, n, captures=int(n >= 2)), at_s=float(n))
-    lines = tracks_of(recorder.target_tracks.kept)
-    assert lines[("t0", 0)][1].tolist() == [[100.0, 200.0], [101.0, 200.0]]
-    assert lines[("t0", 1)][1].tolist() == [[102.0, 200.0], [103.0, 200.0]]
+    places = [(*each.keys, *each.places_m.tolist()) for each in recorder.target_tracks.kept]
+    assert places == [(("t0", int(n >= 2)), [100.0 + n, 200.0]) for n in range(4)]
 
 
 def test_of_two_marks_on_a_cell_the_newer_counts_and_a_cleared_one_is_gone(recorder: Recorder) -> None:
@@ -397,11 +396,11 @@ def test_tracks_forget_every_second_sampling_instead_of_growing() -> None:
     samplings = Thinned[Sampling](100, lambda sampling: len(sampling.keys))
     for now_ns in range(1000):
         samplings.add(Sampling(now_ns, (("a", 0), ("b", 0)), np.full((2, 2), now_ns, np.float32)))
-    times_ns, places = tracks_of(samplings.kept)["a", 0]
-    assert 25 <= len(places) <= 51
-    assert (times_ns == places[:, 0]).all()
-    assert (places[0, 0], places[-1, 0] > 900) == (0, True)
-    assert (np.diff(places[:, 0]) > 0).all()
+    times_ns = [each.time_ns for each in samplings.kept]
+    assert 25 <= len(times_ns) <= 51
+    assert all((each.places_m == each.time_ns).all() for each in samplings.kept)
+    assert (times_ns[0], times_ns[-1] > 900) == (0, True)
+    assert (np.diff(times_ns) > 0).all()
 
 
 def test_a_run_of_a_day_takes_no_more_memory_than_one_of_an_hour(monkeypatch: pytest.MonkeyPatch) -> None:

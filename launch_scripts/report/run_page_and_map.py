@@ -1,18 +1,27 @@
-"""Pictures of a run: `report.png` with figures, map and plots; the map, which `report.html` has, too; the ground.
+"""The page and the picture of a run, `report.html` and `report.png`, and the map of a run, which both have.
 
 `draw_map` draws the map for both. On the page it is an SVG whose elements are named, so that they can be pressed
-and switched: `vehicle:ID`, `target:ID`, `captures`; the one image in it is that of the marks.
+and switched: `vehicle:ID`, `target:ID`, `captures`; the one image in it is that of the marks. The page says what a
+run's folder holds, in one file.
 """
 
 from __future__ import annotations
 
+import base64
+import io
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from datetime import datetime
 from pathlib import Path
 from typing import Any
 
+import matplotlib as mpl
+import msgspec
 import numpy as np
+from jinja2 import Environment, PackageLoader, StrictUndefined, TemplateError
+from markupsafe import Markup
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -23,17 +32,24 @@ from PIL import Image
 from scipy.ndimage import binary_erosion
 
 from launch_scripts.observe import palette
+from launch_scripts.observe.fact_table import WELL, count, grouped, left_behind
 from launch_scripts.observe.palette import colours_of_groups, rgb, round_length, said_length
-from launch_scripts.report.npz_files import RunTracks, Track
-from launch_scripts.report.plots_and_cards import PLOTS, cards, draw_plot, halo, headline, saved
+from launch_scripts.observe.run_alarms import Alarm
+from launch_scripts.observe.run_folder import REPORT_FILE, SCENARIO_FILE, read_report
+from launch_scripts.observe.summed_counts import percent
+from launch_scripts.report.plots_and_cards import PLOTS, STYLE, cards, draw_plot, halo, headline, saved
+from launch_scripts.report.report_and_tracks import TABLES, TRACKS_FILE, RunTracks, Track, flat, read_tracks
 from launch_scripts.report.run_gis_layers import groups_of
 from shared_map.array_files import Bools, Bytes, Floats
 from shared_map.learning.learned_factors import keys_of
 from shared_map.terrain.pyramid import Level, any_in_blocks, level_of
 from shared_map.terrain.terrain import Terrain
 from shared_map.terrain.zones import zone_mask
+from swarm.clock import NS_PER_S
+from swarm.config.input_files import FileKind, read_bytes, read_text
 from swarm.config.scenario import Scenario
-from swarm.errors import TerrainError
+from swarm.errors import StoreError, TerrainError
+from swarm.files import write_file
 from swarm.grid import GridSpec
 from swarm.wire.messages.map_data import MarkKind
 
@@ -54,6 +70,7 @@ def draw_map(axes: Axes, tracks: RunTracks, report: Mapping[str, Any]) -> None:
     """Draws a run, but not its ground, on axes in kilometres east and south of the north-west corner."""
     grid = tracks.grid
     width_km, height_km = size_km(grid)
+    axes.set(xlim=(0, width_km), ylim=(height_km, 0), aspect="equal")  # first: labels go by them
     if len(tracks.marks.cells):
         axes.imshow(mark_overlay(tracks), extent=(0, width_km, height_km, 0), interpolation="none", zorder=2)
     samples = sum(len(track.time_ns) for track in (*tracks.vehicles, *tracks.targets))
@@ -82,7 +99,6 @@ def draw_map(axes: Axes, tracks: RunTracks, report: Mapping[str, Any]) -> None:
         places[:, 0], places[:, 1], marker="*", s=115, c=palette.YELLOW, edgecolors=palette.BLACK, linewidths=0.7,
         label="capture", zorder=8, gid="captures",
     )  # fmt: skip
-    axes.set(xlim=(0, width_km), ylim=(height_km, 0), aspect="equal")
     axes.grid(False)
     _draw_scale(axes, width_km, height_km)
 
@@ -205,21 +221,22 @@ def ground_picture(terrain: Terrain, scenario: Scenario, truth: Floats | None) -
         "forbidden": forbidden,
         "hidden": hidden_cells(scenario, terrain, truth),
     }
-    for name, cells in areas.items():
-        blocks = Image.fromarray(any_in_blocks(cells, seen.side))
-        inside = np.asarray(blocks.resize(size, Image.Resampling.NEAREST), bool)
-        edge = inside & ~binary_erosion(inside, iterations=_EDGE_PX)
-        match name:
-            case "lethal":
-                pixels[inside] = 0.55 * pixels[inside] + 0.45 * np.array(rgb(palette.LETHAL_GROUND))
-                pixels[inside & (rising | falling)] = rgb("#d7dbe0")
-            case "forbidden":
-                pixels[inside] = 0.5 * photo[inside] + 0.5 * np.array(rgb(palette.BLACK))
-                pixels[edge | (inside & rising)] = rgb(palette.FORBIDDEN)
-            case "hidden":
-                pixels[edge] = 255
-                pixels[edge & ((down + along) // 4 % 2 == 0)] = rgb(palette.BLACK)
+    lethal, forbade, hidden = (
+        np.asarray(Image.fromarray(any_in_blocks(cells, seen.side)).resize(size, Image.Resampling.NEAREST), bool)
+        for cells in areas.values()
+    )
+    pixels[lethal] = 0.55 * pixels[lethal] + 0.45 * np.array(rgb(palette.LETHAL_GROUND))
+    pixels[lethal & (rising | falling)] = rgb("#d7dbe0")
+    pixels[forbade] = 0.5 * photo[forbade] + 0.5 * np.array(rgb(palette.BLACK))
+    pixels[_edge_of(forbade) | (forbade & rising)] = rgb(palette.FORBIDDEN)
+    pixels[_edge_of(hidden)] = 255
+    pixels[_edge_of(hidden) & ((down + along) // 4 % 2 == 0)] = rgb(palette.BLACK)
     return GroundPicture(pixels.astype(np.uint8), tuple(name for name, cells in areas.items() if cells.any()), seen)
+
+
+def _edge_of(inside: Bools) -> Bools:
+    edge: Bools = inside & ~binary_erosion(inside, iterations=_EDGE_PX)
+    return edge
 
 
 def forbidden_cells(scenario: Scenario, terrain: Terrain) -> Bools:
@@ -318,3 +335,147 @@ def _draw_head(figure: Figure, report: dict[str, Any]) -> None:
         figure.text(x, 0.896, tile.text, fontsize=14, fontweight="bold", color=tones[tile.tone], va="center")
         figure.text(x, 0.869, tile.label, fontsize=8, color=palette.FAINT, va="center")
         x += unit * width
+
+
+# --- the page -----------------------------------------------------------------------------------------------------
+
+PAGE_FILE = "report.html"
+_NOTES_SHOWN = 400
+_ROWS_SHOWN = 2000
+_MAP_IN = 10.0
+"""The longer side of the map."""
+_PLOT_IN, _PLOT = (4.1, 1.8), (0.125, 0.135, 0.775, 0.7)
+"""Size of a plot, and where its axes are in it."""
+
+
+def write_page(folder: Path) -> Path:
+    """Writes the page of a run from what its folder holds. Raises ConfigError or StoreError in one sentence."""
+    report = read_report(folder)
+    path = folder / PAGE_FILE
+    try:
+        text = page_of(folder, report)
+    except (TypeError, KeyError, ValueError, AttributeError, IndexError, ArithmeticError, TemplateError) as error:
+        raise StoreError(f"{folder / REPORT_FILE} is damaged: {type(error).__name__}: {error}") from error
+    write_file(path, text.encode())
+    return path
+
+
+def page_of(folder: Path, report: Mapping[str, Any]) -> str:
+    """The page's text. The template escapes all that it is given, and raises where something is missing."""
+    environment = Environment(
+        loader=PackageLoader("launch_scripts.report", "templates"),
+        autoescape=True,
+        undefined=StrictUndefined,
+        trim_blocks=True,
+        lstrip_blocks=True,
+    )
+    environment.filters.update(percent=percent, count=count)
+    scenario = folder / SCENARIO_FILE
+    recording = folder / "run.rrd"  # without a byte where the monitor ended before it drew anything
+    notes = list(report.get("notes") or [])
+    return environment.get_template(
+        "report.html.j2"
+    ).render(
+        report=report,
+        name=folder.resolve().name,
+        where=f"{folder.resolve().parent.name}/{folder.resolve().name}",
+        facts=headline(report, folder.resolve().name),
+        cards=cards(report),
+        verdict=(said := str(report.get("verdict") or "")),
+        well=WELL in said,
+        alarms=_alarms(report),
+        left_behind=left_behind(report),
+        map=_map(folder, report),
+        slower=SLOWER,
+        quicker=QUICKER,
+        plots=[
+            (plot, _svg(_PLOT_IN, _PLOT, lambda axes, plot=plot: draw_plot(axes, plot, report, titled=False)))  # type: ignore[misc]
+            for plot in PLOTS
+        ],
+        tables=[_table(section, heading, report) for section, (_, heading) in TABLES.items()],
+        notes=notes[-_NOTES_SHOWN:],
+        notes_left=max(len(notes) - _NOTES_SHOWN, 0),
+        scenario=read_text(scenario, FileKind.SCENARIO) if scenario.exists() else None,
+        recording=recording.is_file() and recording.stat().st_size > 0,
+    )
+
+
+def _alarms(report: Mapping[str, Any]) -> list[tuple[str, bool, list[str]]]:
+    """Returns the alarms, the serious first: a line, whether it is serious, and the lines that it summarises."""
+    size = report.get("terrain") or {}
+    grid = GridSpec(size.get("rows", 1), size.get("cols", 1), 1.0)
+    began = (report.get("made") or {}).get("began")
+    began_ns = None if began is None else round(datetime.fromisoformat(began).timestamp() * NS_PER_S)
+    told = [replace(each, began_ns=began_ns) for each in msgspec.convert(report.get("alarms") or [], list[Alarm])]
+    return [
+        (line, serious, [each.line(grid) for each in alarms] if len(alarms) > 1 else [])
+        for serious in (True, False)
+        for line, alarms in grouped((each for each in told if each.serious == serious), grid)
+    ]
+
+
+def _table(section: str, heading: str, report: Mapping[str, Any]) -> dict[str, Any]:
+    rows = {id: flat(id, row) for id, row in (report.get(section) or {}).items()}
+    columns = list(dict.fromkeys(name for row in rows.values() for name in row))[1:]
+    shown = list(rows.items())[:_ROWS_SHOWN]
+    return {
+        "section": section,
+        "heading": heading,
+        "columns": [name.replace("_", " ") for name in columns],
+        "rows": [(id, [_cell(name, row.get(name)) for name in columns]) for id, row in shown],
+        "left": len(rows) - len(shown),
+    }
+
+
+def _cell(name: str, value: Any) -> tuple[str, Any]:
+    """Its text, and what it is sorted by."""
+    if value is None:
+        return "–", ""
+    if name in ("certified_gap_mean", "certified_gap_p95", "certified_gap_max"):
+        return percent(value), value
+    return (count(value) if isinstance(value, int | float) else str(value)), value
+
+
+# --- drawings of the page, as SVG ---------------------------------------------------------------------------------
+
+
+def _map(folder: Path, report: Mapping[str, Any]) -> dict[str, Any] | None:
+    """Returns the input of the page's map: a drawing over pictures; None without tracks."""
+    if not (folder / TRACKS_FILE).exists():
+        return None
+    tracks = read_tracks(folder / TRACKS_FILE)
+    width_km, height_km = size_km(tracks.grid)
+    scale = _MAP_IN / max(width_km, height_km)
+
+    return {
+        "svg": _svg(
+            (width_km * scale, height_km * scale), (0, 0, 1, 1), lambda axes: draw_map(axes, tracks, report)
+        ),
+        "groups": colours_of_groups(report),
+        "marks": len(tracks.marks.cells),
+        "ground": _picture(folder / GROUND_FILE, "image/webp"),
+        "learned": _picture(folder / LEARNED_FILE, "image/png"),
+    }
+
+
+def _picture(path: Path, kind: str) -> str | None:
+    """A file as an address that holds it; None where there is none."""
+    if not path.exists():
+        return None
+    return f"data:{kind};base64,{base64.b64encode(read_bytes(path, FileKind.RUN)).decode()}"
+
+
+def _svg(
+    size_in: tuple[float, float], place: tuple[float, float, float, float], draw: Callable[[Axes], None]
+) -> Markup:
+    """Returns the drawing of `draw` on axes at a place of a figure, as an SVG element as wide as its place. Its
+    text is text, and the page says in which font."""
+    with mpl.rc_context(fname=STYLE):
+        figure = Figure(figsize=size_in)
+        axes = figure.add_axes(place)
+        draw(axes)
+        file = io.StringIO()
+        figure.savefig(file, format="svg", transparent=True, metadata={"Date": None, "Creator": None})
+    head, _, rest = file.getvalue().partition("<svg ")[2].partition(">")
+    sized = re.sub(r' (width|height)="[^"]*"', "", f" {head}")
+    return Markup(f"<svg{sized}>{rest}")  # matplotlib has escaped what it was given

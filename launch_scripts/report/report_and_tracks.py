@@ -1,16 +1,20 @@
-"""The arrays that a run leaves, so that it can be drawn and exported after it: `tracks.npz` and `ground.npz`.
+"""Data that a run leaves behind: `report.json`, tables as CSV, and arrays, `tracks.npz` and `ground.npz`.
 
-Both are archives of NumPy. A file may be cut off, or made by another program: it is checked whole, or refused in
-one sentence, before it is used.
+The arrays are archives of NumPy, by which a run can be drawn and exported after it. A file may be cut off, or made
+by another program: it is checked whole, or refused in one sentence, before it is used. `write_report` also has the
+pictures and the page made.
 """
 
 from __future__ import annotations
 
 import contextlib
+import csv
+import importlib.metadata
 import io
 import json
 import math
 import zipfile
+from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import asdict, dataclass
 from pathlib import Path
@@ -21,14 +25,109 @@ import numpy as np
 from numpy.typing import NDArray
 
 from launch_scripts.observe.latest_messages import MarkedCells
-from launch_scripts.observe.run_recorder import Recorder, tracks_of
+from launch_scripts.observe.palette import image_bytes
+from launch_scripts.observe.run_folder import REPORT_FILE, ended
+from launch_scripts.observe.run_recorder import Recorder
+from shared_map.learning.learned_factors import factors_in, learned_kinds
 from shared_map.terrain.pyramid import Level
 from shared_map.terrain.terrain import Terrain
+from shared_map.terrain.terrain_report import bounds_deg
 from swarm.clock import NS_PER_S
 from swarm.config.input_files import FileKind, read_bytes
 from swarm.errors import OutsideGridError, StoreError
+from swarm.files import write_file
 from swarm.grid import GridSpec, walk
 from swarm.wire.messages.map_data import STAMP_LIMIT_NS, MarkKind
+
+PICTURE_FILE = "report.png"
+
+
+def make_report(recorder: Recorder, terrain: Terrain, **measured: Any) -> dict[str, Any]:
+    """The numbers of a run, its terrain and its course.
+
+    measured  what the caller knows better than the recorder, as `Recorder.report` takes it
+    """
+    return with_series(recorder.report(**measured), recorder, terrain)
+
+
+def with_series(numbers: Mapping[str, Any], recorder: Recorder, terrain: Terrain) -> dict[str, Any]:
+    """The numbers of a run, its terrain and its course."""
+    return {
+        **numbers,
+        "version": importlib.metadata.version("terrain-swarm"),
+        "terrain": {
+            "digest": terrain.digest,
+            **asdict(terrain.grid),
+            **bounds_deg(terrain.grid),
+            "notes": list(terrain.notes),
+        },
+        "learned_kinds": [each._asdict() for each in learned_kinds(recorder.observed.learned_words())],
+        "series": recorder.series(),
+        "distributions": recorder.distributions(),
+        "notes": recorder.notes_told(),
+    }
+
+
+def write_report(
+    folder: Path,
+    report: dict[str, Any],
+    recorder: Recorder,
+    terrain: Terrain,
+    *,
+    truth: NDArray[np.float32] | None = None,
+) -> None:
+    """Writes the files named above. Raises StoreError if the folder cannot be written.
+
+    truth  true pace of every cell, to outline hidden obstacles; None if it is secret or unknown
+    """
+    report = {**report, **({"made": made} if (made := ended(folder)) else {})}
+    from launch_scripts.report import run_page_and_map as pages  # matplotlib takes a moment
+
+    tracks, factors = packed_tracks(recorder), factors_in(recorder.observed.learned_words())
+    ground = pages.ground_picture(terrain, recorder.scenario, truth)
+    report = {**report, "ground_shows": ground.drawn}
+    write_file(folder / REPORT_FILE, json.dumps(report, indent=1, allow_nan=False).encode() + b"\n")
+    for section, (file, _) in TABLES.items():
+        write_file(folder / file, csv_of(section, report))
+    write_file(folder / TRACKS_FILE, tracks)
+    write_file(folder / pages.GROUND_FILE, image_bytes(ground.pixels, "WEBP"))
+    write_file(folder / GROUND_PACE_FILE, packed_ground(terrain, ground.level))
+    if (factors != 1).any():
+        pixels = pages.learned_pixels(terrain, factors)
+        write_file(folder / pages.LEARNED_FILE, image_bytes(pixels, "PNG"))
+    shown = tracks_in(tracks, folder / TRACKS_FILE)
+    pages.save_picture(folder / PICTURE_FILE, ground, shown, report)
+    pages.write_page(folder)
+
+
+TABLES = {"by_target": ("targets.csv", "target"), "by_group": ("groups.csv", "group"),
+          "by_vehicle": ("vehicles.csv", "vehicle")}  # fmt: skip
+"""Section of the report -> its file, and what its first column is called."""
+
+
+def csv_of(section: str, report: Mapping[str, Any]) -> bytes:
+    """One row per target, group or vehicle. Missing values are empty."""
+    rows = [flat(id, row) for id, row in report[section].items()]
+    columns = list(dict.fromkeys(["id", *(name for row in rows for name in row)]))
+    file = io.StringIO()
+    writer = csv.DictWriter(file, columns, lineterminator="\n")
+    writer.writerow({**dict(zip(columns, columns, strict=True)), "id": TABLES[section][1]})
+    writer.writerows(rows)
+    return file.getvalue().encode()
+
+
+def flat(id: str, row: Mapping[str, Any]) -> dict[str, Any]:
+    """A row without tables inside: `certified_gap_mean` and so on."""
+    values: dict[str, Any] = {"id": id}
+    for name, value in row.items():
+        if name == "certified_gap":
+            values |= {f"{name}_{part}": (value or {}).get(part) for part in ("mean", "p95", "max", "unproven")}
+        else:
+            values[name] = value
+    return values
+
+
+# --- tracks.npz and ground.npz ------------------------------------------------------------------------------------
 
 TRACKS_FILE, GROUND_PACE_FILE = "tracks.npz", "ground.npz"
 _LEAST_M, _FARTHEST_M = 1e-4, 1e12
@@ -46,25 +145,23 @@ _KINDS: Mapping[str, Any] = {
     "place": np.float32,
 }
 """Kind of a column -> its type. A count is not below 0, a time one that a message may have, a place two lengths."""
-_COLUMNS: Mapping[str, tuple[str, str]] = {
-    **{
-        f"{of}_{name}": (f"{of}{table}", kind)
-        for of in ("vehicles", "targets")
-        for name, table, kind in (
-            ("id", "", "text"), ("piece", "", "whole"), ("samples", "", "count"),
-            ("time_ns", " sampled", "time"), ("place_m", " sampled", "place"),
-        )
-    },
-    **{f"captures_{name}": ("captures", kind) for name, kind in (
-        ("id", "text"), ("time_ns", "time"), ("place_m", "place"))},
-    **{f"marks_{name}": ("marks", kind) for name, kind in (
-        ("cells", "count"), ("kinds", "byte"), ("paces", "pace"), ("stamps_ns", "time"))},
-    **{f"routes_{name}": ("routes", kind) for name, kind in (
-        ("vehicle", "text"), ("target", "text"), ("time_ns", "time"), ("start", "whole"), ("cost_s", "real"),
-        ("bound_s", "real"), ("steps", "count"), ("many_legs", "count"))},
-    "routes_directions": ("steps of routes", "byte"),
-    "routes_legs": ("legs of routes", "count"),
+_OF_TRACKS = {"id": "text", "piece": "whole", "samples": "count"}
+_OF_SAMPLES = {"time_ns": "time", "place_m": "place"}
+_TABLES: Mapping[str, tuple[str, Mapping[str, str]]] = {
+    "vehicles": ("vehicles", _OF_TRACKS),
+    "vehicles sampled": ("vehicles", _OF_SAMPLES),
+    "targets": ("targets", _OF_TRACKS),
+    "targets sampled": ("targets", _OF_SAMPLES),
+    "captures": ("captures", {"id": "text", **_OF_SAMPLES}),
+    "marks": ("marks", {"cells": "count", "kinds": "byte", "paces": "pace", "stamps_ns": "time"}),
+    "routes": ("routes", {
+        "vehicle": "text", "target": "text", "time_ns": "time", "start": "whole", "cost_s": "real",
+        "bound_s": "real", "steps": "count", "many_legs": "count",
+    }),
+    "steps of routes": ("routes", {"directions": "byte"}),
+    "legs of routes": ("routes", {"legs": "count"}),
 }  # fmt: skip
+_COLUMNS = {f"{of}_{name}": (table, kind) for table, (of, kinds) in _TABLES.items() for name, kind in kinds.items()}
 """Column of `tracks.npz` -> the table that it belongs to, and its kind. All columns of a table are as long.
 
 A row of vehicles or targets is a piece of a track, and says how many samples it has: all stand track by track.
@@ -153,27 +250,31 @@ def packed_ground(terrain: Terrain, seen: Level) -> bytes:
 def packed_tracks(recorder: Recorder) -> bytes:
     """The content of `tracks.npz`."""
     observed, captures, begun = recorder.observed, recorder.captures, recorder.routes.kept
-    began_ns, marked, routes = observed.began_ns or 0, observed.marked(), [each.route for each in begun]
+    began_ns, routes = observed.began_ns or 0, [each.route for each in begun]
     columns: dict[str, Any] = {}
-    for of, tracks in (("vehicles", recorder.vehicle_tracks), ("targets", recorder.target_tracks)):
-        lines = dict(sorted(tracks_of(tracks.kept).items()))
+    for of, sampled in (("vehicles", recorder.vehicle_tracks.kept), ("targets", recorder.target_tracks.kept)):
+        keys = [key for each in sampled for key in each.keys]
+        order = sorted(range(len(keys)), key=keys.__getitem__)  # stable: a piece stays in order of time
+        times_ns = [each.time_ns for each in sampled for _ in each.keys]
+        places_m = np.concatenate([np.zeros((0, 2)), *(each.places_m for each in sampled)])
+        pieces = sorted(Counter(keys).items())
         columns |= {
-            f"{of}_id": [id for id, _ in lines],
-            f"{of}_piece": [piece for _, piece in lines],
-            f"{of}_samples": [len(times) for times, _ in lines.values()],
-            f"{of}_time_ns": [time for times, _ in lines.values() for time in times.tolist()],
-            f"{of}_place_m": np.concatenate([np.zeros((0, 2)), *(places for _, places in lines.values())]),
+            f"{of}_id": [id for (id, _), _ in pieces],
+            f"{of}_piece": [piece for (_, piece), _ in pieces],
+            f"{of}_samples": [samples for _, samples in pieces],
+            f"{of}_time_ns": [times_ns[n] for n in order],
+            f"{of}_place_m": places_m[np.array(order, np.intp)],
         }
     columns |= {
         "captures_id": [each.target for each in captures],
         "captures_time_ns": [began_ns + int(each.time_s * NS_PER_S) for each in captures],
         "captures_place_m": [(each.east_m, each.south_m) for each in captures],
-        **{f"marks_{name}": getattr(marked, name) for name in ("cells", "kinds", "paces", "stamps_ns")},
-        "routes_vehicle": [route.vehicle for route in routes],
-        "routes_target": [route.target for route in routes],
+        **{f"marks_{name}": column for name, column in observed.marked()._asdict().items()},
+        **{
+            f"routes_{name}": [getattr(route, name) for route in routes]
+            for name in ("vehicle", "target", "start", "cost_s")
+        },
         "routes_time_ns": [each.time_ns for each in begun],
-        "routes_start": [route.start for route in routes],
-        "routes_cost_s": [route.cost_s for route in routes],
         "routes_bound_s": [route.lower_bound_s for route in routes],
         "routes_steps": [len(route.directions) for route in routes],
         "routes_directions": np.frombuffer(b"".join(route.directions for route in routes), np.uint8),
@@ -238,13 +339,12 @@ def tracks_in(content: bytes, path: Path) -> RunTracks:
         for name, (table, _) in _COLUMNS.items():
             if rows.setdefault(table, len(columns[name])) != len(columns[name]):
                 raise ValueError(f"the columns of {table} differ in length")
-        places = _on_map(columns["captures_place_m"], grid)
-        ids, times_ns = columns["captures_id"].tolist(), columns["captures_time_ns"]
+        captures = zip(*(columns[f"captures_{name}"] for name in ("id", "time_ns", "place_m")), strict=True)
         return RunTracks(
             grid,
             _tracks(columns, "vehicles", grid),
             _tracks(columns, "targets", grid),
-            [Track(id, 0, times_ns[n : n + 1], places[n : n + 1]) for n, id in enumerate(ids)],
+            [Track(str(id), 0, time_ns[None], _on_map(place_m, grid)) for id, time_ns, place_m in captures],
             _marks(columns, grid),
             _routes(columns, grid),
             int(arrays["began_ns"]),
@@ -293,7 +393,7 @@ def _tracks(columns: Mapping[str, NDArray[Any]], name: str, grid: GridSpec) -> l
 
 
 def _marks(columns: Mapping[str, NDArray[Any]], grid: GridSpec) -> MarkedCells:
-    marks = MarkedCells(*(columns[f"marks_{name}"] for name in ("cells", "kinds", "paces", "stamps_ns")))
+    marks = MarkedCells(*(columns[f"marks_{name}"] for name in MarkedCells._fields))
     if marks.cells.max(initial=0) >= grid.cells:
         raise ValueError("marks lie outside of the grid")
     if not np.isfinite(marks.paces[marks.kinds == MarkKind.PACE]).all():
