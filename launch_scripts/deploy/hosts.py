@@ -96,7 +96,7 @@ def _faults(config: HostsConfig) -> Iterator[str]:
             yield f"{where}: found {host.address!r}, expected a name or an address under which others reach it"
         check_endpoint(host.endpoint(config.port), True, where)
         if len(config.hosts) > 1 and is_loopback(host.address):
-            yield f"{where}: found {host.address!r}, which is another machine to each; expected an address for all"
+            yield f"{where}: found {host.address!r}, which to each machine is itself; expected one for all"
         if len(set(host.roles)) < len(host.roles):
             yield f"hosts[{n}].roles: found a role twice, expected each once"
 

@@ -31,6 +31,7 @@ from launch_scripts.observe.run_folder import REPORT_FILE, DiskWatch, begin_run
 from launch_scripts.observe.run_observer import ask_run
 from launch_scripts.observe.run_recorder import Recorder
 from launch_scripts.observe.run_registry import LAUNCHER_LOG, register
+from launch_scripts.plain_text import number_of
 from launch_scripts.ports import check_ports, page_of
 from launch_scripts.process_table import LAUNCHER, RECORDED_BESIDE, TABLE, ProcessSpec
 from launch_scripts.report.report_and_tracks import make_report, write_report
@@ -362,8 +363,8 @@ class _Run:
         """States the one address of the run's page. It shows the terrain first, and the live view once the monitor
         has loaded it."""
         self._web_port = port
-        self._terminal.say(f"page of the run, the terrain first and then the live view: {page_of(port)}", "bold")
-        self._terminal.say(f"from elsewhere: {tunnel(port)}, then the same address")
+        self._terminal.say(f"open {page_of(port)}: the terrain now, the live view in a moment", "bold")
+        self._terminal.say(f"from another computer: run `{tunnel(port)}` there, then open the same address")
 
     def _register(self) -> None:
         """Registers the run's progress for other commands; `begin_run` has reported any failure."""
@@ -375,6 +376,7 @@ class _Run:
             self._terminal.show(lambda: known.line(title, now_ns, self._swarm.restarts))
             return
         state = known.summary(now_ns)
+        missing = missing or [number_of(all - up, role) for role, (up, all) in state.crew.items() if up < all]
         title = self._title(f"{facts.fact('processes_well').shown(state)} needed", missing)
         self._terminal.show(lambda: plain_line(state, title), lambda console: live_table(state, title, console))
 
@@ -383,7 +385,7 @@ class _Run:
         the numbers at the end have them."""
         since_s = time.monotonic() - self._options.began_s - (self._startup_s or 0.0)
         if self._startup_s is None:
-            waits = f", waits for {', '.join(missing) or 'the whole swarm'}" * (len(missing) < 4)
+            waits = f", waits for {', '.join(missing) or 'the rest of the swarm'}" * (len(missing) < 4)
             return f"{self._scenario.name}: starting, {up} processes are up{waits}, {since_s:.0f} s"
         of = "" if self._outlasts else self._limit(" of")
         until = ", until the live view is closed, or Ctrl-C" if self._outlasts else ""

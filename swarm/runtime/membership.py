@@ -250,7 +250,7 @@ class Member:
             self.counters.gauge(MESSAGES_PER_S, (sent - self._rate_of) / passed_s)
             skipped = dropped - self._dropped
             if skipped >= _BEHIND_TICKS:
-                text = f"{self._name} is behind: it skipped {skipped} ticks in {passed_s:.1f} s"
+                text = f"{self._name} skipped {skipped} ticks in {passed_s:.1f} s"
                 self.alarms.begin("behind", self._name, text, now_ns)
             elif not skipped:
                 self.alarms.end("behind", self._name, now_ns)

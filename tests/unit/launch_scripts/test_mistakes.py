@@ -40,7 +40,7 @@ WORDS_OF_LIBRARIES = re.compile(
     r"Traceback|`(int|float|str|bool|array|object|null|struct)|[Ee]xpected `|Object contains|Usage:|[╭│╰]|Errno|"
     r"msgspec|TOMLDecode|ValidationError|\$\.|CPLE_|ZError"
 )
-BUSY = re.compile(r"^(.*, \d+ s \.\.\.|page of the run, .*|from elsewhere: .*)\n", re.MULTILINE)
+BUSY = re.compile(r"^(.*, \d+ s \.\.\.|open http://.*|from another computer: .*)\n", re.MULTILINE)
 """Output of a slow machine meanwhile."""
 LONGEST_ANSWER = 400
 """Characters; two lines of a wide terminal."""
