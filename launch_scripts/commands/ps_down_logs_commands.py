@@ -205,7 +205,7 @@ def kill(process: Annotated[str, typer.Argument(metavar="ROLE-ID")], run: RunOpt
     running = found.processes()
     again = "its launcher starts it again" if found.launchers else "it had no launcher any more"
     if process not in running:
-        has = choice(process, sorted(running) or ["none"], " it has ")
+        has = choice(process, sorted(running), " it has ") if running else "; it has none"
         raise ConfigError(f"run {found.name} has no process {process!r} on this machine{has}")
     try:
         psutil.Process(running[process]).kill()
