@@ -346,7 +346,7 @@ def _finite(value: Any) -> str:
 
 def _meant_number(key: str, value: Any, kind: Any) -> str:
     """Returns the number that a text holds, as a suggestion."""
-    if not isinstance(value, str) or kind not in (int, float):
+    if not isinstance(value, str) or len(value) > _LONGEST_LIST or kind not in (int, float):
         return ""
     match = re.fullmatch(r"\s*([+-]?(?:\d+[.,]?\d*|[.,]\d+))\s*(\S.*?)?\s*", value)
     if match is None:

@@ -407,7 +407,8 @@ def checked_xml(data: bytes, what: str) -> None:
             name = element.tag.rpartition("}")[2]
             places: list[list[str]] = []
             if name == "coordinates":
-                text = re.sub(r"\s*,\s*", ",", "".join(element.itertext()).strip())
+                # Blanks begin where they begin, or each of them would be tried.
+                text = re.sub(r"(?<!\s)\s*,\s*", ",", "".join(element.itertext()).strip())
                 places = [place.split(",") for place in text.split()] or [[]]
             elif name == "coord":
                 places = [(element.text or "").split()]
