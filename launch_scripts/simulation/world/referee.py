@@ -170,6 +170,7 @@ class Referee:
             return self._air.on_fleet(fleet)
         broken: list[Broken] = []
         author, seq, stamp_ns = fleet.author, fleet.seq, fleet.stamp_ns
+        key = FLEET.below({"region": str(fleet.region), "author": author})
         vehicles, stays, covered = self._vehicles, self._stays, self._obstacles.covered
         # In one loop: each vehicle reports in every tick, and all that most of them have to say is that they are
         # still where they were.
@@ -178,7 +179,7 @@ class Referee:
                 continue
             stay = vehicles.get(id)
             if stay is None:
-                broken += self._enter(id, cell, 0, fleet)
+                broken += self._enter(id, cell, 0, key, fleet)
                 continue
             before_ns = stay.end_ns
             if stamp_ns <= before_ns:
@@ -195,15 +196,14 @@ class Referee:
                     broken += self._met(stay)
             if not (stands and same):
                 since_ns = before_ns if same and not gapless else until_ns
-                broken += self._enter(id, cell, since_ns, fleet)
+                broken += self._enter(id, cell, since_ns, key, fleet)
         if stamp_ns - self._swept_ns > NS_PER_S:
             self._sweep(stamp_ns)
         return broken
 
-    def _enter(self, id: str, cell: int, since_ns: int, fleet: Fleet) -> Iterator[Broken]:
-        """A vehicle comes onto a cell."""
+    def _enter(self, id: str, cell: int, since_ns: int, key: str, fleet: Fleet) -> Iterator[Broken]:
+        """A vehicle comes onto a cell, as a report under this key says."""
         author, seq, stamp_ns = fleet.author, fleet.seq, fleet.stamp_ns
-        key = FLEET.below({"region": str(fleet.region), "author": author})
         entered = Stay(id, cell, stamp_ns, stamp_ns, since_ns, key, author, seq, seq)
         self._stays.setdefault(cell, []).append(entered)
         if (left := self._vehicles.get(id)) is not None:
@@ -279,13 +279,13 @@ class ObstacleReferee:
         left = before.covers
         record = self._records[key] = _Record(seq, now_ns + int(obstacle.lease_s * NS_PER_S), {}, {})
         if obstacle.lease_s > 0.0:
+            who, below = f"obstacle {obstacle.id}", OBSTACLE.below({"id": obstacle.id})
             for cell in capsule_of(obstacle, self._grid, obstacle.speed_m_per_s * REACTION_S).cells(self._grid):
                 record.closed_ns[cell] = before.closed_ns.get(cell, now_ns) if lasts else now_ns
             for cell in capsule_of(obstacle, self._grid, 0.0).cells(self._grid):
                 cover = left.pop(cell, None) if lasts else None
                 if cover is None:
-                    who, since_ns = f"obstacle {obstacle.id}", record.closed_ns.get(cell, now_ns)
-                    below = OBSTACLE.below({"id": obstacle.id})
+                    since_ns = record.closed_ns.get(cell, now_ns)
                     cover = Stay(who, cell, now_ns, 0, since_ns, below, obstacle.id, seq, seq)
                     self._covers.setdefault(cell, []).append(cover)
                 cover.end_ns, cover.seq = record.until_ns, seq
