@@ -28,12 +28,12 @@ from vehicle_agent.driving.driven_vehicle import PLACES, GivenRoute, Reason, Veh
 from vehicle_agent.driving.driver import Driver
 from vehicle_agent.driving.dynamics import PluginDynamics
 from vehicle_agent.goal_queues import REASONS, GoalQueues
-from vehicle_agent.obstacles import Obstacles
 from vehicle_agent.sensing.sensor import Findings, Sensor, compare
 from vehicle_agent.sensing.target_detector import EmptyPlaces
 from vehicle_agent.target_choice import AskCosts, Assignment, GroupCosts
 from vehicle_agent.traffic.detours import Detours
 from vehicle_agent.traffic.next_cells import FAR_CELLS, CellRequests, Steering
+from vehicle_agent.traffic.obstacles import Obstacles
 
 _MANY_WAIT = 0.025
 """Share of the vehicles. In free traffic fewer wait, and a third of the CPU time of 1,000 vehicles went into acts

@@ -22,6 +22,9 @@ from swarm.config.vehicle_classes import GROUND, class_named, class_numbers, fli
 from swarm.errors import ConfigError
 from swarm.grid import REGION_CELLS
 from swarm.plugins.find import named_plugin
+from swarm.right_of_way.agent_core import RightOfWay
+from swarm.right_of_way.agent_session import RightOfWaySync
+from swarm.right_of_way.promise_store import PromiseStore
 from swarm.right_of_way.shards import Shards
 from swarm.runtime.membership import Member
 from swarm.runtime.role_setup import RoleSetup
@@ -29,16 +32,13 @@ from vehicle_agent.agent import Agent
 from vehicle_agent.agent_maps import AgentMaps, ZonesAround
 from vehicle_agent.assignment import AssignmentWorld, assigner_of, shares_costs
 from vehicle_agent.driving.dynamics import DynamicsWorld, dynamics_of, own_dynamics
-from vehicle_agent.obstacles import Obstacles, TargetObstacles
 from vehicle_agent.position_reports import ChasersReport, FleetReport
-from vehicle_agent.promise_store import PromiseStore
-from vehicle_agent.right_of_way_sync import RightOfWaySync
 from vehicle_agent.sensing.sensor import SensorWorld, sensor_of
 from vehicle_agent.sensing.target_detector import TargetDetector
 from vehicle_agent.start_cells import Spawning, entry_cells, spawn_cells
 from vehicle_agent.target_choice import GroupCosts
 from vehicle_agent.traffic.next_cells import FAR_CELLS
-from vehicle_agent.traffic.right_of_way_core import RightOfWay
+from vehicle_agent.traffic.obstacles import Obstacles, TargetObstacles
 
 _ACTS = 10
 """Number of times that an agent acts on right of way while a vehicle crosses the fastest cell, at its ticks or

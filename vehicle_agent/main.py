@@ -10,11 +10,11 @@ from shared_map.vehicle_class_grounds import load_classes
 from swarm.bus.bus import Bus
 from swarm.recording.role_process import run_role
 from swarm.recording.service_boundary import Boundary
+from swarm.right_of_way.promise_store import PROMISE_STORE, FilePromiseStore, PromiseStore
 from swarm.runtime.inbox import Inbox
 from swarm.runtime.loop_health import GENERATION_BEFORE
 from swarm.runtime.process import tick_phase
 from swarm.runtime.role_setup import RoleSetup
-from vehicle_agent.promise_store import PROMISE_STORE, FilePromiseStore, PromiseStore
 from vehicle_agent.service import AgentService
 
 

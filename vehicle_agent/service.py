@@ -19,6 +19,7 @@ from swarm.bus.bus import Appeared, Asked, AskEnded, Bus, Disappeared, Event, He
 from swarm.clock import NS_PER_S
 from swarm.config.agent_plan import place_job
 from swarm.peers import Roster, job_of
+from swarm.right_of_way.promise_store import PromiseStore
 from swarm.runtime.membership import MemberService
 from swarm.runtime.order_client import OrderClient
 from swarm.runtime.role_setup import RoleSetup
@@ -32,7 +33,6 @@ from swarm.wire.messages.vehicles import Followed, Obstacle, Removed, RemoveVehi
 from vehicle_agent.agent import AgentAction, AskRoutes
 from vehicle_agent.agent_parts import AgentParts
 from vehicle_agent.driving.driven_vehicle import PLACES, Places, goal_of
-from vehicle_agent.promise_store import PromiseStore
 from vehicle_agent.target_choice import AskCosts
 
 log = logging.getLogger(__name__)

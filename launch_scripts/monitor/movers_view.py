@@ -37,7 +37,7 @@ from swarm.wire.messages import Message
 from swarm.wire.messages.orders import GoalState
 from swarm.wire.messages.planning import Believed, Sighted
 from swarm.wire.messages.vehicles import Fleet, Followed, Obstacle, VehicleState
-from vehicle_agent.obstacles import Obstacles
+from vehicle_agent.traffic.obstacles import Obstacles
 
 Cells = NDArray[np.int64]
 _ROUTES_KEPT = 1 << 15

@@ -41,9 +41,9 @@ from swarm.wire.messages.map_data import DIGEST_ROW, Digest
 from swarm.wire.messages.vehicles import Obstacle, VehicleState
 from swarm.wire.topics import DIGEST, OBSTACLE
 from vehicle_agent.driving.driven_vehicle import Vehicle
-from vehicle_agent.obstacles import capsule_of
 from vehicle_agent.service import AgentService
 from vehicle_agent.start_cells import spawn_cells
+from vehicle_agent.traffic.obstacles import capsule_of
 
 LONGEST_WAIT_S = 10.0
 ROUTED_WITHIN_S = 5.0

@@ -29,11 +29,11 @@ from swarm.config.agent_plan import AddedAgent
 from swarm.errors import StoreError
 from swarm.recording.record_inputs import Recording
 from swarm.recording.service_boundary import Boundary
+from swarm.right_of_way.promise_store import PROMISE_STORE, PromiseStore
 from swarm.runtime.first_use import Modules, in_loop
 from swarm.runtime.process import Service
 from swarm.runtime.role_setup import RoleSetup
 from swarm.runtime.stats import ENDED
-from vehicle_agent.promise_store import PROMISE_STORE, PromiseStore
 from vehicle_agent.service import AgentService
 
 if TYPE_CHECKING:

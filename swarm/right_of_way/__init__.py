@@ -7,9 +7,11 @@ vehicles in a shard or at its border. A *generation* is one numbered start of a 
 *entries* for each cell (`host_entries`): the vehicle of an entry enters the cell once all before it are over. An
 entry is never revoked and never runs out: only its host ends it.
 
-This package is the side of hosts. Members and leaders are in `vehicle_agent/traffic`; the proof is in
-docs/design/right-of-way.md, and docs/design/external-vehicles.md says how external vehicles come into it. All but
-`external_session` and the file of generations is pure: time and chance are arguments.
+The proof is in docs/design/right-of-way.md; docs/design/external-vehicles.md says how external vehicles come into
+it. Hosts: `host`, `holdings`, `host_entries`, `generations`. Members: `shard_leader`, `shard_member`, and, where
+certificates prove names, `shard_witness`. An agent (`agent_core`) is both. `agent_session` and `external_session`
+carry the messages, `promise_store` and the file of generations keep what was said; all else is pure: time and chance
+are arguments.
 
 Duties of a host (`Host`, which keeps what it holds in `Holdings`):
 
@@ -40,6 +42,19 @@ Duties of a leader:
    cells further ahead than a vehicle keeps only where no other is near.
 3. Begin with the newest table that any of a majority has on file, and tell hosts of no table before a majority has
    it on file.
+4. Plan all vehicles without a next cell at once (`pibt`), and append their entries to the orders of cells
+   (`cell_orders`): a vehicle follows one that goes on.
+
+Duties of a member:
+
+1. Put the leader's table on file, under (epoch, number), before saying so (`Stored`). With the leader's own file one
+   is a majority: then hosts receive the grants of the table.
+2. Replace a leader that is silent for a lease: claim a higher epoch; the others promise to store no table of a lower
+   one (Paxos). Promises are on file, too, before any message states them.
+3. Where certificates prove names, judge each table before it is stored: then one member may lie. Hosts count the
+   members themselves.
+
+No clock decides anything but when to claim.
 
 Messages (`swarm.wire.messages.traffic`), of which all but `Left` and a `Table` of changes carry the whole state of
 their key:

@@ -1,7 +1,7 @@
 """Entries: a vehicle's place in the order of vehicles for each cell, as its host acts on them. Pure.
 
 A leader keeps one order of entries for each cell, and appends at its end only
-(`vehicle_agent.traffic.cell_orders`). The vehicle of an entry enters the cell once every entry before it is over.
+(`swarm.right_of_way.cell_orders`). The vehicle of an entry enters the cell once every entry before it is over.
 An entry is over by the word `Left` of the host that had it, or by a usable table that lists it no more. Both are
 facts for good, so loss, repetition, order and age of messages do no harm. A vehicle may therefore set out for a
 cell while another leaves it, and stops at the border of its own cell until the word is there.

@@ -15,14 +15,14 @@ from support.shard_tables import GRID, MEMBERS, holdings_of, standing
 from support.thief import Thief, ThiefWorld
 from support.traffic_world import Faults, Process, TrafficWorld, random_faults
 
+from swarm.right_of_way import shard_member
 from swarm.right_of_way.holdings import Holdings
 from swarm.right_of_way.host import GENERATIONS_KEPT
 from swarm.right_of_way.host_entries import HostEntries
+from swarm.right_of_way.shard_member import Member
+from swarm.right_of_way.shard_witness import Witness, _Host
 from swarm.right_of_way.shards import Shards
 from swarm.wire.messages.traffic import Fence, Held, HostState, Stand, Table, Word
-from vehicle_agent.traffic import shard_member
-from vehicle_agent.traffic.shard_member import Member
-from vehicle_agent.traffic.shard_witness import Witness, _Host
 
 LIES_S = 8.0
 SHAPES = ((4, 4, 8, 8), (5, 4, 9, 9), (6, 3, 12, 6), (4, 5, 8, 8))

@@ -37,6 +37,7 @@ from swarm.config.load import parse_scenario
 from swarm.config.scenario import Scenario
 from swarm.errors import ProtocolError
 from swarm.peers import Peer
+from swarm.right_of_way.promise_store import PromiseStore
 from swarm.wire.access import Act, Authenticator
 from swarm.wire.codec import decode
 from swarm.wire.fields import OR_INFINITE, Column, taken_apart
@@ -44,7 +45,6 @@ from swarm.wire.messages.map_data import MarkKind
 from swarm.wire.messages.planning import RouteReply, RouteRequest
 from swarm.wire.route_columns import RouteStatus
 from swarm.wire.topics import MARKS, PUSHED_ROUTE, ROUTE, RUN, SIGHTED, Topic
-from vehicle_agent.promise_store import PromiseStore
 from vehicle_agent.service import AgentService
 
 PLAIN = """

@@ -22,9 +22,9 @@ from swarm.wire.messages.vehicles import Obstacle
 from vehicle_agent.agent import Agent
 from vehicle_agent.agent_maps import LocalMap
 from vehicle_agent.driving.driver import Driver
-from vehicle_agent.obstacles import REACTION_S, Capsule, Obstacles
 from vehicle_agent.sensing.sensor import TruthSensor
 from vehicle_agent.traffic.next_cells import Steering
+from vehicle_agent.traffic.obstacles import REACTION_S, Capsule, Obstacles
 
 GRID = GridSpec(9, 11, 5.0, west_m=100.0, north_m=900.0)
 MARGIN_M = 0.5
@@ -293,7 +293,7 @@ def test_without_any_one_rule_a_vehicle_drives_into_an_obstacle(rule, monkeypatc
     elif rule == "turn back":
         monkeypatch.setattr(Driver, "end_path", lambda self, vehicle: None)
     elif rule == "reaction":
-        monkeypatch.setattr("vehicle_agent.obstacles.REACTION_S", 0.0)
+        monkeypatch.setattr("vehicle_agent.traffic.obstacles.REACTION_S", 0.0)
     else:
-        monkeypatch.setattr("vehicle_agent.obstacles.NS_PER_S", NS_PER_S // 4)
+        monkeypatch.setattr("vehicle_agent.traffic.obstacles.NS_PER_S", NS_PER_S // 4)
     assert any(drive(seed).into for seed in range(40))

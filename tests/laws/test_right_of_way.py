@@ -23,14 +23,14 @@ from support.traffic_world import TICK_NS, Faults, Process, TrafficWorld, random
 
 from swarm.grid import GridSpec
 from swarm.right_of_way import host_entries
+from swarm.right_of_way.agent_core import OwnRecord, RightOfWay
+from swarm.right_of_way.agent_session import OwnTime
+from swarm.right_of_way.cell_orders import Orders
 from swarm.right_of_way.holdings import Holdings
+from swarm.right_of_way.shard_leader import Leader
+from swarm.right_of_way.shard_member import Member
 from swarm.right_of_way.shards import Shards
 from swarm.wire.messages.traffic import Fence, Held, KnownRequest, Table
-from vehicle_agent.right_of_way_sync import OwnTime
-from vehicle_agent.traffic.cell_orders import Orders
-from vehicle_agent.traffic.right_of_way_core import OwnRecord, RightOfWay
-from vehicle_agent.traffic.shard_leader import Leader
-from vehicle_agent.traffic.shard_member import Member
 
 QUIET_S = 12.0
 SHAPES = ((3, 4, 9, 9), (4, 3, 10, 5), (8, 3, 14, 7), (2, 5, 8, 4), (5, 4, 12, 4), (1, 5, 7, 4))

@@ -19,10 +19,10 @@ from shared_map.keeper.mark_store import KeeperStore
 from swarm.errors import SwarmError
 from swarm.grid import GridSpec
 from swarm.right_of_way.generations import GenerationFile
+from swarm.right_of_way.promise_store import FilePromiseStore
 from swarm.wire.messages.map_data import MarkKind
 from swarm.wire.messages.orders import Order
 from swarm.wire.messages.traffic import Held, Table
-from vehicle_agent.promise_store import FilePromiseStore
 
 COMMITS = 12
 Files = dict[str, bytes]

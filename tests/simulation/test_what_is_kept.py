@@ -15,11 +15,11 @@ from launch_scripts.simulation.simulate import Simulation
 from shared_map.terrain.terrain import Terrain
 from swarm.config.agent_plan import agent_of
 from swarm.config.scenario import RoverConfig, Scenario
+from swarm.right_of_way.cell_orders import Orders
+from swarm.right_of_way.shard_leader import Leader
 from swarm.wire.messages.traffic import Entry, Held, Number, Table
 from vehicle_agent.driving.driven_vehicle import Vehicle
-from vehicle_agent.traffic.cell_orders import Orders
 from vehicle_agent.traffic.next_cells import CellRequests
-from vehicle_agent.traffic.shard_leader import Leader
 
 ROVERS = (
     RoverConfig(name="quick", count=3, speed_m_per_s=3.0, radius_m=4.0),

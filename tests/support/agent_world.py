@@ -21,6 +21,7 @@ from swarm.config.agent_plan import AgentPlan, plan_agents
 from swarm.config.load import parse_scenario
 from swarm.grid import walk
 from swarm.peers import Peer
+from swarm.right_of_way.promise_store import PromiseStore
 from swarm.wire.fields import column
 from swarm.wire.messages.map_data import MarkKind, MarkSet
 from swarm.wire.messages.planning import CostReply, CostRequest, RouteReply, RouteRequest, TargetPose
@@ -28,7 +29,6 @@ from swarm.wire.messages.vehicles import Fleet, Followed, VehicleState
 from swarm.wire.route_columns import Route, RouteBatch, RouteStatus
 from swarm.wire.topics import COST, FLEET, FOLLOWED, MARKS, POSE, ROUTE
 from vehicle_agent.driving.driven_vehicle import Vehicle
-from vehicle_agent.promise_store import PromiseStore
 from vehicle_agent.service import AgentService
 
 SCENARIO = """

@@ -7,9 +7,9 @@ from collections.abc import Callable
 import pytest
 from support.traffic_world import TrafficWorld
 
+from swarm.right_of_way.cell_orders import Orders
 from swarm.right_of_way.host_entries import BEFORE_ALL, HostEntries
 from swarm.wire.messages.traffic import Entry
-from vehicle_agent.traffic.cell_orders import Orders
 
 Broken = Callable[[pytest.MonkeyPatch], None]
 

@@ -8,11 +8,11 @@ from functools import partial
 
 from support.traffic_world import MS, NS_PER_S, TICK_NS, Disk, Faults, Process, TrafficWorld
 
+from swarm.right_of_way.agent_core import Action, OwnRecord, RightOfWay
 from swarm.right_of_way.external_vehicle import ExternalAction, ExternalVehicle, Removal, SaveGenerations
 from swarm.right_of_way.holdings import Tell
 from swarm.right_of_way.host import AskKnown
 from swarm.wire.messages.traffic import Granted, Known, KnownRequest, Left
-from vehicle_agent.traffic.right_of_way_core import Action, OwnRecord, RightOfWay
 
 _ANOTHER_CELL_NS = 2 * NS_PER_S
 

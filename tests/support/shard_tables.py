@@ -7,11 +7,11 @@ from collections.abc import Mapping, Sequence
 
 from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec
+from swarm.right_of_way.agent_core import OwnRecord, RightOfWay
 from swarm.right_of_way.holdings import Holdings
+from swarm.right_of_way.shard_member import RoundTrips
 from swarm.right_of_way.shards import Shards
 from swarm.wire.messages.traffic import Granted, Held, HostState, Number, Stand, Table
-from vehicle_agent.traffic.right_of_way_core import OwnRecord, RightOfWay
-from vehicle_agent.traffic.shard_member import RoundTrips
 
 GRID = GridSpec(8, 8, 1.0)
 AGENTS = [f"a{n}" for n in range(5)]

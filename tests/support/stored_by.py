@@ -16,11 +16,11 @@ from msgspec.json import encode
 from support.wire_strategies import EXAMPLES
 
 from swarm.grid import GridSpec
-from vehicle_agent.promise_store import FilePromiseStore
+from swarm.right_of_way.promise_store import FilePromiseStore
 
 try:
     from shared_map.keeper.mark_store import KeeperStore
-    from vehicle_agent.traffic.right_of_way_core import OwnRecord
+    from swarm.right_of_way.agent_core import OwnRecord
 except ModuleNotFoundError:  # a build from before these modules had a name of their own
     from shared_map.keeper.store import KeeperStore
     from vehicle_agent.traffic.right_of_way import OwnRecord

@@ -11,11 +11,11 @@ from support.traffic_world import Disk, Faults, Process, TrafficWorld
 
 from swarm.clock import NS_PER_S
 from swarm.config.agent_plan import agent_of
+from swarm.right_of_way.agent_core import Action
+from swarm.right_of_way.cell_orders import Orders
 from swarm.right_of_way.holdings import Tell, part_of
+from swarm.right_of_way.shard_member import AskPromises
 from swarm.wire.messages.traffic import Fence, Granted, Held, HostState, Left, Number, Stored, Table, Word
-from vehicle_agent.traffic.cell_orders import Orders
-from vehicle_agent.traffic.right_of_way_core import Action
-from vehicle_agent.traffic.shard_member import AskPromises
 
 _EPOCHS = (0, 1, 1, 2, 50)
 """Number of its own epochs by which a lie is ahead."""

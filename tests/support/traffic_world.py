@@ -13,13 +13,13 @@ from swarm.clock import NS_PER_S
 from swarm.config.agent_plan import agent_of
 from swarm.grid import GridSpec
 from swarm.peers import Peer
+from swarm.right_of_way.agent_core import Action, OwnRecord, RightOfWay
+from swarm.right_of_way.agent_session import OwnTime
 from swarm.right_of_way.holdings import Tell, Wish
 from swarm.right_of_way.host import AskKnown
+from swarm.right_of_way.shard_member import AskPromises, Refused, Save
 from swarm.right_of_way.shards import Shards
 from swarm.wire.messages.traffic import Entry, Granted, Known, KnownRequest, Left, Stored, Table, Word
-from vehicle_agent.right_of_way_sync import OwnTime
-from vehicle_agent.traffic.right_of_way_core import Action, OwnRecord, RightOfWay
-from vehicle_agent.traffic.shard_member import AskPromises, Refused, Save
 
 MS = NS_PER_S // 1000
 TICK_NS = 100 * MS

@@ -18,7 +18,7 @@ from shared_map.terrain.step_climb import Climb
 from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec
 from vehicle_agent.driving.driven_vehicle import Vehicle
-from vehicle_agent.obstacles import Obstacles
+from vehicle_agent.traffic.obstacles import Obstacles
 
 _LOOK_CELLS = 200
 """Cells of the route ahead that are searched for obstacles, and behind an obstacle for where to come back."""

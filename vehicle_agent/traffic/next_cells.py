@@ -15,11 +15,11 @@ from shared_map.terrain.step_climb import Climb
 from swarm.clock import NS_PER_S
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec, Window
+from swarm.right_of_way.cell_orders import cells_beside
 from swarm.right_of_way.holdings import Holdings, Wish
 from vehicle_agent.agent_maps import meet
 from vehicle_agent.driving.driven_vehicle import Vehicle
-from vehicle_agent.obstacles import Obstacles
-from vehicle_agent.traffic.cell_orders import cells_beside
+from vehicle_agent.traffic.obstacles import Obstacles
 
 _NEAR_CELLS = 8
 """Cells of the route to which a vehicle that was pushed off it may return."""

@@ -23,7 +23,7 @@ from swarm.grid import GridSpec
 from swarm.wire.fields import column
 from swarm.wire.messages.vehicles import MOST_M_PER_S, MOST_RADIUS_M, Fleet, Obstacle
 from swarm.wire.topics import FLEET, OBSTACLE
-from vehicle_agent.obstacles import MOST_OBSTACLES, REACTION_S, capsule_of
+from vehicle_agent.traffic.obstacles import MOST_OBSTACLES, REACTION_S, capsule_of
 
 _SKEW_NS = NS_PER_S // 200
 """Shorter overlaps are no collision: the clocks of two processes may differ by as much."""

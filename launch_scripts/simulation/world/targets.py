@@ -32,7 +32,7 @@ from swarm.runtime.tracker_ownership import Trackings
 from swarm.wire.fields import column
 from swarm.wire.messages.planning import TargetPose
 from swarm.wire.messages.vehicles import NO_TARGET, Fleet, Obstacle, VehicleState
-from vehicle_agent.obstacles import TargetObstacles
+from vehicle_agent.traffic.obstacles import TargetObstacles
 
 LISTEN_NS = NS_PER_S
 """A starting process asks planners where their targets are before it places them itself: it waits this time for a

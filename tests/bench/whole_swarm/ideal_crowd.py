@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components, dijkstra
 
-from vehicle_agent.traffic.pibt import Mover, Round
+from swarm.right_of_way.pibt import Mover, Round
 
 _TARGETS = 4
 _WALK_STEPS, _COOL_STEPS, _ASSIGN_STEPS = 5, 20, 50

@@ -35,7 +35,7 @@ from swarm.config.setting_types import Walk
 from swarm.errors import ConfigError, TerrainError
 from swarm.grid import GridSpec
 from swarm.wire.messages.vehicles import Obstacle
-from vehicle_agent.obstacles import REACTION_S, capsule_of
+from vehicle_agent.traffic.obstacles import REACTION_S, capsule_of
 
 NOBODY = np.empty(0, np.int64)
 

@@ -8,14 +8,14 @@ import pytest
 from swarm.errors import BusError, ConfigError, DamagedError, StoreError
 from swarm.grid import GridSpec
 from swarm.right_of_way import external_session
+from swarm.right_of_way import shard_leader as leaders
 from swarm.right_of_way.external_session import ExternalService, ExternalSession
 from swarm.right_of_way.external_vehicle import ExternalVehicle, Removal
 from swarm.right_of_way.generations import GenerationFile, MemoryGenerations
+from swarm.right_of_way.shard_leader import Leader
 from swarm.right_of_way.shards import Shards
 from swarm.wire.codec import decode, encode
 from swarm.wire.messages.traffic import Fence, Granted, Held, HostState, Known, Stand, Table
-from vehicle_agent.traffic import shard_leader as leaders
-from vehicle_agent.traffic.shard_leader import Leader
 
 GRID = GridSpec(64, 64, 1.0)
 SHARDS = Shards(GRID, ["a0", "a1", "a2"])

@@ -12,8 +12,8 @@ from swarm.grid import GridSpec, Window
 from swarm.right_of_way.holdings import Wish
 from swarm.wire.messages.vehicles import Obstacle
 from vehicle_agent.driving.driven_vehicle import GivenRoute, Vehicle
-from vehicle_agent.obstacles import Obstacles
 from vehicle_agent.traffic.next_cells import FAR_CELLS, CellRequests, Steering
+from vehicle_agent.traffic.obstacles import Obstacles
 
 GRID = GridSpec(24, 24, 10.0, 0.0, 240.0)
 TICK_NS = NS_PER_S // 10

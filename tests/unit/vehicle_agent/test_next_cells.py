@@ -20,8 +20,8 @@ from swarm.wire.route_columns import RouteStatus
 from vehicle_agent.agent_maps import LocalMap
 from vehicle_agent.driving.driven_vehicle import GivenRoute, Vehicle
 from vehicle_agent.driving.driver import Driver
-from vehicle_agent.obstacles import Obstacles
 from vehicle_agent.traffic.next_cells import Steering
+from vehicle_agent.traffic.obstacles import Obstacles
 
 GRID = GridSpec(8, 8, 10.0)
 LEVEL = np.full((8, 8), 0.1, np.float32)

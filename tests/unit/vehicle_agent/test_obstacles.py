@@ -16,9 +16,9 @@ from swarm.grid import GridSpec
 from swarm.right_of_way.holdings import Wish
 from swarm.wire.messages.vehicles import Obstacle
 from vehicle_agent.driving.driven_vehicle import GivenRoute, Vehicle
-from vehicle_agent.obstacles import MOST_CELLS_OF_ONE, MOST_OBSTACLES, Obstacles
 from vehicle_agent.traffic.detours import Detours
 from vehicle_agent.traffic.next_cells import Steering
+from vehicle_agent.traffic.obstacles import MOST_CELLS_OF_ONE, MOST_OBSTACLES, Obstacles
 
 GRID = GridSpec(40, 40, 10.0)
 NOW = 10**18

@@ -9,7 +9,7 @@ from swarm.config.load import parse_scenario
 from swarm.errors import ConfigError
 from swarm.grid import GridSpec
 from swarm.wire.messages.planning import TargetPose
-from vehicle_agent.obstacles import Obstacles, TargetObstacles
+from vehicle_agent.traffic.obstacles import Obstacles, TargetObstacles
 
 GRID = GridSpec(20, 20, 10.0)
 NOW = 10**18

@@ -13,11 +13,11 @@ from support.traffic_world import Disk, Faults, Process, TrafficWorld
 import swarm.right_of_way.shards
 from swarm.errors import ConfigError, StoreError
 from swarm.grid import MOST_SHARDS, REGION_CELLS, GridSpec
+from swarm.right_of_way.agent_core import Action, OwnRecord, RightOfWay
 from swarm.right_of_way.external_session import ExternalService
 from swarm.right_of_way.generations import MemoryGenerations
 from swarm.right_of_way.shards import Shards
 from swarm.wire.messages.traffic import Known, KnownRequest, Stored, Table
-from vehicle_agent.traffic.right_of_way_core import Action, OwnRecord, RightOfWay
 
 GRID = GridSpec(1100, 1100, 1.0)
 SMALL, LARGE = REGION_CELLS, 2 * REGION_CELLS

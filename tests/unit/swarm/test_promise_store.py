@@ -18,10 +18,10 @@ from launch_scripts.simulation.simulate import Simulation
 from swarm.config.revocations import revoke
 from swarm.config.scenario import NetworkConfig, TlsConfig
 from swarm.errors import DamagedError, StoreError
+from swarm.right_of_way import promise_store
+from swarm.right_of_way.agent_core import OwnRecord, RightOfWay
+from swarm.right_of_way.promise_store import FilePromiseStore, PromiseStore
 from swarm.wire.messages.traffic import Held, Table
-from vehicle_agent import promise_store
-from vehicle_agent.promise_store import FilePromiseStore, PromiseStore
-from vehicle_agent.traffic.right_of_way_core import OwnRecord, RightOfWay
 
 
 def table(shard: int, seq: int) -> Table:
@@ -82,7 +82,7 @@ _PROMISES = """
 import itertools, sys
 from pathlib import Path
 from swarm.wire.messages.traffic import Held, Table
-from vehicle_agent.promise_store import FilePromiseStore
+from swarm.right_of_way.promise_store import FilePromiseStore
 store = FilePromiseStore(Path(sys.argv[1]))
 start = max((promised for promised, _ in store.saved.values()), default=0)
 for promised in itertools.count(start + 1):

@@ -3,11 +3,11 @@
 from msgspec.structs import replace
 from support.shard_tables import SHARDS, S, cells_of, entries, standing, table_of
 
+from swarm.right_of_way.cell_orders import Orders
 from swarm.right_of_way.generations import HEARTBEAT_NS, first_generation, is_far_ahead
 from swarm.right_of_way.holdings import Holdings
+from swarm.right_of_way.shard_leader import Leader
 from swarm.wire.messages.traffic import Held, Stand
-from vehicle_agent.traffic.cell_orders import Orders
-from vehicle_agent.traffic.shard_leader import Leader
 
 
 def test_a_cell_is_free_again_only_by_the_word_of_its_host() -> None:

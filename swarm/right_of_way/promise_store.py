@@ -15,8 +15,8 @@ from swarm.config.scenario import NetworkConfig
 from swarm.errors import ConfigError, DamagedError
 from swarm.journal import Journal
 from swarm.recording.service_boundary import ExternalCalls
+from swarm.right_of_way.agent_core import OwnRecord
 from swarm.wire.messages.traffic import Table
-from vehicle_agent.traffic.right_of_way_core import OwnRecord
 
 _SIZE_BYTES = 1 << 18
 """Size of the file at first."""

@@ -13,14 +13,14 @@ from swarm.bus.bus import Appeared, Asked, AskEnded, Bus, Disappeared, Event, He
 from swarm.clock import NS_PER_S
 from swarm.config.agent_plan import plan_agents
 from swarm.peers import Peer
+from swarm.right_of_way.agent_core import Action, OwnRecord, RightOfWay
 from swarm.right_of_way.holdings import Tell, Wish
 from swarm.right_of_way.host import AskKnown
+from swarm.right_of_way.promise_store import PromiseStore
+from swarm.right_of_way.shard_member import SLOW_NS, AskPromises, Refused, Save
 from swarm.runtime.role_setup import RoleSetup
 from swarm.wire.messages import Message, traffic
 from swarm.wire.topics import GRANTED, HOST_STATE, KNOWN, LEFT, STORED, TABLE, WORD, Topic
-from vehicle_agent.promise_store import PromiseStore
-from vehicle_agent.traffic.right_of_way_core import Action, OwnRecord, RightOfWay
-from vehicle_agent.traffic.shard_member import SLOW_NS, AskPromises, Refused, Save
 
 
 class OwnTime:

@@ -10,10 +10,10 @@ from msgspec.structs import replace
 from swarm.config.load import parse_scenario
 from swarm.errors import StoreError
 from swarm.grid import MAX_CELLS, MOST_SHARD_REGIONS, REGION_CELLS, GridSpec
+from swarm.right_of_way.agent_core import OwnRecord, RightOfWay
 from swarm.right_of_way.shards import MOST_SHARDS_AN_AGENT, Shards, fitting_regions
 from swarm.runtime.role_setup import RoleSetup
 from swarm.wire.messages.traffic import Known, KnownRequest
-from vehicle_agent.traffic.right_of_way_core import OwnRecord, RightOfWay
 
 GRID = GridSpec(1100, 1100, 1.0)
 AGENTS = ["a0", "a1", "a2"]

@@ -8,16 +8,16 @@ from support.shard_tables import AGENTS, MEMBERS, S, granted_of, rights_of, tabl
 from swarm.bus.bus import Replied
 from swarm.config.scenario import Scenario
 from swarm.grid import GridSpec
+from swarm.right_of_way.agent_core import Action, OwnRecord, RightOfWay
+from swarm.right_of_way.agent_session import RightOfWaySync
 from swarm.right_of_way.holdings import Tell
 from swarm.right_of_way.host import AskKnown
+from swarm.right_of_way.promise_store import PromiseStore
+from swarm.right_of_way.shard_member import AskPromises, Save
 from swarm.right_of_way.shards import Shards
 from swarm.runtime.role_setup import RoleSetup
 from swarm.wire.messages.traffic import Fence, Held, Known, KnownRequest, Table
 from swarm.wire.topics import KNOWN
-from vehicle_agent.promise_store import PromiseStore
-from vehicle_agent.right_of_way_sync import RightOfWaySync
-from vehicle_agent.traffic.right_of_way_core import Action, OwnRecord, RightOfWay
-from vehicle_agent.traffic.shard_member import AskPromises, Save
 
 THREE = ["a0", "a1", "a2"]
 SHARDS_OF_THREE = Shards(GridSpec(8, 8, 1.0), THREE)

@@ -19,9 +19,9 @@ from swarm.errors import StoreError
 from swarm.grid import REGION_CELLS
 from swarm.right_of_way.holdings import Tell, Wish
 from swarm.right_of_way.host import GENERATIONS_KEPT, AskKnown, Host
+from swarm.right_of_way.shard_member import Member, MemberAction, Refused, RoundTrips
 from swarm.right_of_way.shards import Shards
 from swarm.wire.messages.traffic import Held, HostState, Known, KnownRequest, Left, Stored, Table
-from vehicle_agent.traffic.shard_member import Member, MemberAction, Refused, RoundTrips
 
 _ON_DISK = {"generations": "lives", "shard_cells": "plot_cells"}
 """Names of fields in files, which stay as they were."""

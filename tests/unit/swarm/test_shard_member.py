@@ -5,9 +5,9 @@ from msgspec.structs import replace
 from support.shard_tables import MEMBERS, SHARDS, S, near_members, standing, table_of
 
 from swarm.right_of_way.generations import HEARTBEAT_NS
+from swarm.right_of_way.shard_member import Member, Refused, Save
 from swarm.wire.fields import MOST_IDS
 from swarm.wire.messages.traffic import Granted, Held, Stand, Stored, Table
-from vehicle_agent.traffic.shard_member import Member, Refused, Save
 
 
 def member_of(promised: int = 0) -> Member:

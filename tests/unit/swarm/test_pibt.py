@@ -7,7 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support.shard_tables import GRID
 
-from vehicle_agent.traffic.pibt import Mover, Round
+from swarm.right_of_way.pibt import Mover, Round
 
 
 @given(st.integers(0, 10_000), st.integers(1, 30))

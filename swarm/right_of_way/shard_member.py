@@ -11,10 +11,10 @@ from dataclasses import InitVar, dataclass, field
 
 from swarm.clock import NS_PER_S
 from swarm.right_of_way.generations import FURTHEST_EPOCH, HEARTBEAT_NS
+from swarm.right_of_way.shard_leader import TABLES_KEPT, Leader
+from swarm.right_of_way.shard_witness import Witness, agreed
 from swarm.right_of_way.shards import Shards
 from swarm.wire.messages.traffic import Granted, HostState, Stamp, Stored, Table, Word
-from vehicle_agent.traffic.shard_leader import TABLES_KEPT, Leader
-from vehicle_agent.traffic.shard_witness import Witness, agreed
 
 LEASE_NS = 3 * HEARTBEAT_NS
 """A leader that is silent for this time may be replaced, later if answers take long. Until then its members refuse

@@ -16,12 +16,12 @@ from zlib import crc32
 
 from swarm.clock import NS_PER_S
 from swarm.config.agent_plan import agent_of
+from swarm.right_of_way.cell_orders import Orders, cells_beside
 from swarm.right_of_way.generations import HEARTBEAT_NS, is_far_ahead, is_said
 from swarm.right_of_way.host import GENERATIONS_KEPT
+from swarm.right_of_way.pibt import Mover, Round
 from swarm.right_of_way.shards import Shards
 from swarm.wire.messages.traffic import Granted, HostState, Number, Stamp, Stand, Table
-from vehicle_agent.traffic.cell_orders import Orders, cells_beside
-from vehicle_agent.traffic.pibt import Mover, Round
 
 SILENT_NS = NS_PER_S
 """Vehicles of a host that is silent for this time are obstacles: no vehicle waits for them or pushes them."""
