@@ -9,7 +9,7 @@ from swarm.bus.bus import Event, LinkChanged
 from swarm.errors import RunMismatchError
 from swarm.grid import GridSpec
 from swarm.peers import Peer
-from swarm.runtime.membership import NO_RUN, Member, check_same_run
+from swarm.runtime.membership import NO_RUN, Member, check_belongs, check_same_run
 from swarm.wire.topics import NOTE, RUN, STATS
 
 INFO = run_info(
@@ -95,6 +95,13 @@ def test_one_that_does_not_belong_ends_with_a_sentence_and_the_others_go_on(chan
 
 def test_a_process_that_does_not_say_its_wire_version_speaks_the_last_one_before_any_said_it():
     assert INFO.wire_version == 8
+
+
+def test_a_router_that_answers_first_hides_no_other_run():
+    router, foreign = (msgspec.structs.replace(INFO, **each) for each in (ROUTER, {"run_id": "r2"}))
+    with pytest.raises(RunMismatchError, match="run r2"):
+        check_belongs(INFO, [router, foreign])
+    check_belongs(INFO, [foreign, router, INFO])
 
 
 def test_of_two_that_start_at_once_at_least_one_notices():

@@ -56,6 +56,20 @@ def test_the_steps_of_a_route_are_judged_together_as_they_are_one_by_one(seed, s
     assert climb is None or all(climb.allows(cells[0], each) for each in steering.steps(cells[0]))
 
 
+@pytest.mark.parametrize("lethal", range(9))
+@pytest.mark.parametrize("direction", range(8))
+def test_one_lethal_cell_around_forbids_the_steps_into_it_and_past_its_corner(direction: int, lethal: int) -> None:
+    middle, pace = 3 * GRID.cols + 3, LEVEL.copy()
+    head = dict(GRID.neighbours(middle))[direction]
+    row, col = divmod(lethal, 3)
+    pace[2 + row, 2 + col] = np.inf
+    (south, east), at = np.subtract(divmod(head, 8), divmod(middle, 8)), (row - 1, col - 1)
+    beside = {(south, 0), (0, east)} if south and east else set()
+    forbidden = at == (south, east) or at in beside
+    assert steering_on(None, pace).passable_steps([middle, head]) == (not forbidden)
+    assert steering_on(None, pace, corners=True).passable_steps([middle, head]) == (at != (south, east))
+
+
 class Held:
     """Holdings of one vehicle that was granted a path."""
 
@@ -168,6 +182,15 @@ def test_who_must_make_way_goes_last_where_it_could_not_come_back_from(seed: int
     back = [climb.allows(each, here) for each in wants]
     assert sorted(wants) == sorted(steering.steps(here))
     assert back == sorted(back, reverse=True)
+
+
+def test_who_makes_way_in_reach_of_its_target_stays_in_reach_where_it_can():
+    here, reached = 3 * GRID.cols + 3, {19, 20, 28}
+    vehicle = Vehicle("v", GRID, here)
+    vehicle.target, vehicle.in_reach = "t", True
+    wants = steering_on(None).wish(vehicle, [here], 1, 1, (), lambda _, cell: cell in reached, 0).wants
+    assert len(wants) == 8
+    assert set(wants[:3]) == reached
 
 
 def test_one_that_stands_though_its_route_goes_on_is_blocked_and_one_that_moves_is_not() -> None:
