@@ -18,10 +18,10 @@ from launch_scripts.launcher import run_options
 from launch_scripts.launcher.console import Terminal, tunnel, what_is_left
 from launch_scripts.launcher.fetched_terrain import fetch_if_missing, find_members, missing_files
 from launch_scripts.launcher.forkserver import ROLES_AND_KERNELS, ROLES_ONLY, WarmUp
+from launch_scripts.launcher.launcher_health import LauncherHealth
 from launch_scripts.launcher.local_processes import Ending, LocalSwarm
 from launch_scripts.launcher.log_file import JsonLines, Speaker, log_to
 from launch_scripts.launcher.ordered_planners import OrderedPlanners, with_target
-from launch_scripts.launcher.signals import MachineSignals, StopAsked
 from launch_scripts.launcher.takeover import TakeOver
 from launch_scripts.launcher.terminal_tables import live_table, plain_line
 from launch_scripts.launcher.watcher import OwnPart, Watcher, check_vacant
@@ -35,6 +35,7 @@ from launch_scripts.plain_text import number_of
 from launch_scripts.ports import check_ports, page_of
 from launch_scripts.process_table import LAUNCHER, RECORDED_BESIDE, TABLE, ProcessSpec
 from launch_scripts.report.report_and_tracks import make_report, write_report
+from launch_scripts.stop_requests import StopAsked
 from launch_scripts.web.live_page import LivePage, when_free
 from shared_map.array_files import Floats
 from shared_map.terrain.store import load_beside, load_terrain, load_truth, prepare, scenario_key
@@ -129,7 +130,7 @@ class _Run:
         if options.takes_over:
             targets = options.scenario.target_ids
             self._take_over = TakeOver(run_dir, self._swarm.running, targets, self._terminal.say)
-        self._signals = MachineSignals(options, run_id, self._swarm.seen)
+        self._health = LauncherHealth(options, run_id, self._swarm.seen)
         self._doing: Callable[[], str] = lambda: "preparing the terrain"
         self._page: LivePage | None = None
         """The live view's start page, until the monitor serves it."""
@@ -138,8 +139,8 @@ class _Run:
             told = {"life": "", "at_s": 0.0, "name": f"{self._scenario.name}, run {run_id}"}
             self._page = when_free(lambda: LivePage(view.web_port, lambda: {**told, "state": self._doing()}))
             self._say_page(view.web_port)
-        if self._signals.url:
-            self._terminal.say(f"metrics at {self._signals.url}; /healthz and /readyz beside them")
+        if self._health.url:
+            self._terminal.say(f"metrics at {self._health.url}; /healthz and /readyz beside them")
 
     def run(self) -> int:
         """The whole run. The exit code is 0 only if all went well."""
@@ -150,7 +151,7 @@ class _Run:
             return self._run()
         finally:
             self._warm_up.close()
-            self._signals.close()
+            self._health.close()
             self._leave_page()
 
     def _run(self) -> int:
@@ -348,7 +349,7 @@ class _Run:
     def _tell(self, watcher: Watcher) -> None:
         known = watcher.known
         up = known.own_up() if isinstance(known, OwnPart) else None
-        self._signals.turned(known.observed, self._started_ns, self._missing(watcher), up)
+        self._health.turned(known.observed, self._started_ns, self._missing(watcher), up)
         if (sentence := self._disk.check_room(time.monotonic())) is not None:
             self._terminal.say(sentence, "red")
         for note in watcher.take_notes():
@@ -409,7 +410,7 @@ class _Run:
 
     def _stop(self, watcher: Watcher) -> list[str]:
         """Stops all roles in order, and records their last messages."""
-        self._signals.ends()
+        self._health.ends()
         self._terminal.close()
         asked = "; once more, and what still runs is killed" if self._stop_asked else ""
         self._terminal.say(f"stopping{asked}")

@@ -10,8 +10,8 @@ entry is never revoked and never runs out: only its host ends it.
 The proof is in docs/design/right-of-way.md; docs/design/external-vehicles.md says how external vehicles come into
 it. Hosts: `host`, `holdings`, `host_entries`, `generations`. Members: `shard_leader`, `shard_member`, and, where
 certificates prove names, `shard_witness`. An agent (`agent_core`) is both. `agent_session` and `external_session`
-carry the messages, `promise_store` and the file of generations keep what was said; all else is pure: time and chance
-are arguments.
+carry the messages; `promise_store` and the file of generations keep what was said. All else is pure: time and
+chance are arguments.
 
 Duties of a host (`Host`, which keeps what it holds in `Holdings`):
 
@@ -47,10 +47,10 @@ Duties of a leader:
 
 Duties of a member:
 
-1. Put the leader's table on file, under (epoch, number), before saying so (`Stored`). With the leader's own file one
-   is a majority: then hosts receive the grants of the table.
-2. Replace a leader that is silent for a lease: claim a higher epoch; the others promise to store no table of a lower
-   one (Paxos). Promises are on file, too, before any message states them.
+1. Put the leader's table on file, under (epoch, number), before saying so (`Stored`). With the leader's own file
+   one is a majority: then hosts receive the grants of the table.
+2. Replace a leader that is silent for a lease: claim a higher epoch; the others promise to store no table of a
+   lower one (Paxos). Promises are on file, too, before any message states them.
 3. Where certificates prove names, judge each table before it is stored: then one member may lie. Hosts count the
    members themselves.
 

@@ -20,7 +20,7 @@ from support.live_swarm import SWARM, client, write_scenario
 from support.neighbour import ROOT, environment_of, neighbour_tree
 from support.processes import eventually
 
-from launch_scripts.launcher.signals import SAME_S
+from launch_scripts.stop_requests import SAME_S
 from swarm.bus.bus import Event, Heard
 from swarm.bus.endpoints import listening
 from swarm.bus.zenoh_bus import ZenohBus

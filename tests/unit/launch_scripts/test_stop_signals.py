@@ -16,8 +16,7 @@ import pytest
 from support import contained
 from support.processes import eventually
 
-from launch_scripts.launcher.signals import StopAsked
-from launch_scripts.stop_requests import stop_requests
+from launch_scripts.stop_requests import StopAsked, stop_requests
 
 NUMBERS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
@@ -34,7 +33,7 @@ def _handlers() -> Iterator[None]:
 @pytest.fixture
 def clock(monkeypatch: pytest.MonkeyPatch) -> Callable[[float], None]:
     now_s = [100.0]
-    monkeypatch.setattr("launch_scripts.launcher.signals.time.monotonic", lambda: now_s[0])
+    monkeypatch.setattr("launch_scripts.stop_requests.time.monotonic", lambda: now_s[0])
     return lambda seconds: now_s.__setitem__(0, now_s[0] + seconds)
 
 
@@ -93,7 +92,7 @@ def test_the_report_is_written_after_two_signals_and_left_by_one_more(clock: Cal
 _TALKER = """
 import logging, sys, time
 from pathlib import Path
-from launch_scripts.launcher.signals import StopAsked
+from launch_scripts.stop_requests import StopAsked
 from launch_scripts.launcher.console import Terminal
 
 asked, terminal, out = StopAsked(), Terminal(False, sys.argv[2] == "plain"), Path(sys.argv[1])

@@ -16,9 +16,9 @@ from hypothesis import strategies as st
 from support.effort import few
 
 from launch_scripts.launcher import takeover
+from launch_scripts.launcher.launcher_health import LauncherHealth
 from launch_scripts.launcher.local_processes import Running
 from launch_scripts.launcher.run_options import UpOptions
-from launch_scripts.launcher.signals import MachineSignals
 from launch_scripts.launcher.takeover import TakeOver, writing
 from launch_scripts.observe.latest_messages import LatestState, RunPlan
 from launch_scripts.process_table import ProcessSpec
@@ -226,11 +226,11 @@ def test_who_writes_a_file_is_found_and_who_reads_it_is_not(tmp_path: Path, mode
 @pytest.mark.network
 def test_the_port_of_figures_is_opened_once_the_launcher_before_has_left_it(tmp_path: Path) -> None:
     observed = LatestState(RunPlan((), (), 0), GridSpec(4, 5, 30.0))
-    before = MachineSignals(UpOptions(Scenario(), tmp_path, (), metrics_port=0), "run-1", list)
+    before = LauncherHealth(UpOptions(Scenario(), tmp_path, (), metrics_port=0), "run-1", list)
     options = UpOptions(Scenario(), tmp_path, (), metrics_port=int(before.url.split(":")[2].partition("/")[0]))
     with pytest.raises(BusError, match="Address already in use"):
-        MachineSignals(options, "run-1", list)
-    after = MachineSignals(dataclasses.replace(options, takes_over=True), "run-1", list)
+        LauncherHealth(options, "run-1", list)
+    after = LauncherHealth(dataclasses.replace(options, takes_over=True), "run-1", list)
     after.turned(observed, 0, [])
     assert after.url == ""
     before.close()
