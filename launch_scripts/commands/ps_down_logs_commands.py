@@ -29,7 +29,7 @@ from swarm.errors import ConfigError, StoreError, SwarmError
 from swarm.files import check_writable, make_folder
 
 if TYPE_CHECKING:
-    from launch_scripts.observe.run_registry import KnownRun
+    from launch_scripts.observe.local_runs import KnownRun
 
 app = typer.Typer()
 
@@ -59,7 +59,7 @@ def ps(all: Annotated[bool, typer.Option("--all", "-a")] = False, as_json: AsJso
     from rich.console import Console
 
     from launch_scripts.launcher.terminal_tables import columns
-    from launch_scripts.observe.run_registry import logging_into, open_logs, registered
+    from launch_scripts.observe.local_runs import logging_into, open_logs, registered
 
     logs = list(open_logs())
     found = [(run, len(logging_into(run.folder, logs))) for run in registered()]
@@ -92,8 +92,8 @@ def down(run: RunArgument = None) -> int:
     import psutil
 
     from launch_scripts.launcher.console import Terminal, what_is_left
+    from launch_scripts.observe.local_runs import is_of_a_swarm
     from launch_scripts.observe.run_folder import read_report
-    from launch_scripts.observe.run_registry import is_of_a_swarm
 
     found = _chosen(run, only=True)
     terminal, until_s = Terminal(as_json=False, plain=False), time.monotonic() + _DOWN_S
@@ -216,7 +216,7 @@ def kill(process: Annotated[str, typer.Argument(metavar="ROLE-ID")], run: RunOpt
 def in_background(*, as_json: bool) -> int:
     """Runs this command again in the background, without `-d`. Returns once the swarm is whole, or else the exit
     code of the command. Raises ConfigError or StoreError if the run could not be found later."""
-    from launch_scripts.observe.run_registry import registered, registry
+    from launch_scripts.observe.local_runs import registered, registry
 
     if as_json:
         raise ConfigError("--json prints the report at the end, and --detach does not wait for it")
@@ -246,8 +246,8 @@ def in_background(*, as_json: bool) -> int:
 def _chosen(name: str | None, only: bool = False) -> KnownRun:
     """The run of a name or folder; without one the newest active run, else the newest ended one. Raises
     ConfigError, with `only` also if several runs are active."""
+    from launch_scripts.observe.local_runs import registered
     from launch_scripts.observe.run_folder import LAST, RUNS, find_run
-    from launch_scripts.observe.run_registry import registered
 
     # LAST is the newest run of this folder; in a folder without runs it must not end one of several others.
     if name is None or (name == LAST and not os.path.isdir(RUNS / LAST)):
@@ -265,7 +265,7 @@ def _chosen(name: str | None, only: bool = False) -> KnownRun:
 
 def _run_in(folder: Path) -> KnownRun:
     """The run of a folder as it is now, also if it is not registered or the folder is not there any more."""
-    from launch_scripts.observe.run_registry import KnownRun, registered
+    from launch_scripts.observe.local_runs import KnownRun, registered
 
     return next((run for run in registered() if run.folder == folder), KnownRun(folder, (), 0, False))
 

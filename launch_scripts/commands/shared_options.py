@@ -210,8 +210,8 @@ def find_swarm(runs: Path | None = None, name: str | None = None) -> list[tuple[
     name  of the run, or its folder; only that is looked at then
     Raises BusError if no router listens, ConfigError if there is no run of that name.
     """
+    from launch_scripts.observe.local_runs import registered
     from launch_scripts.observe.run_folder import RUNS, find_run
-    from launch_scripts.observe.run_registry import registered
     from swarm.bus.endpoints import listening
     from swarm.config.scenario import NetworkConfig
 

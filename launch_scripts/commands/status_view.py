@@ -18,8 +18,8 @@ from launch_scripts.launcher.console import Tell, make_output_outlive_readers, p
 from launch_scripts.launcher.terminal_tables import columns, fitted, loads_table, targets_table, whole_output
 from launch_scripts.observe import fact_table as facts
 from launch_scripts.observe.latest_messages import LatestState
+from launch_scripts.observe.local_runs import pids_of
 from launch_scripts.observe.run_observer import OutsideObserver, frame_of_members
-from launch_scripts.observe.run_registry import pids_of
 from launch_scripts.observe.run_state import RunState, state_of
 from launch_scripts.observe.summed_counts import ProcessLoad, gaps_to
 from launch_scripts.plain_text import plain, unanswered

@@ -27,10 +27,10 @@ from launch_scripts.launcher.terminal_tables import live_table, plain_line
 from launch_scripts.launcher.watcher import OwnPart, Watcher, check_vacant
 from launch_scripts.observe import fact_table as facts
 from launch_scripts.observe.latest_messages import plan_of_members
+from launch_scripts.observe.local_runs import LAUNCHER_LOG, register
+from launch_scripts.observe.recorder import Recorder
 from launch_scripts.observe.run_folder import REPORT_FILE, DiskWatch, begin_run
 from launch_scripts.observe.run_observer import ask_run
-from launch_scripts.observe.run_recorder import Recorder
-from launch_scripts.observe.run_registry import LAUNCHER_LOG, register
 from launch_scripts.plain_text import number_of
 from launch_scripts.ports import check_ports, page_of
 from launch_scripts.process_table import LAUNCHER, RECORDED_BESIDE, TABLE, ProcessSpec

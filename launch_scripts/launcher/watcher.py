@@ -6,11 +6,11 @@ import time
 from collections.abc import Collection
 
 from launch_scripts.launcher.terminal_tables import SHOWN_ALARMS
+from launch_scripts.observe.alarms import alarms_of
 from launch_scripts.observe.fact_table import lines_of
 from launch_scripts.observe.latest_messages import LatestState, RunPlan
-from launch_scripts.observe.run_alarms import alarms_of
+from launch_scripts.observe.recorder import Recorder
 from launch_scripts.observe.run_observer import HEARD, RECORDED, RunObserver
-from launch_scripts.observe.run_recorder import Recorder
 from launch_scripts.process_table import TABLE, ProcessSpec
 from swarm.bus.bus import Bus, Disappeared, Event, Heard
 from swarm.clock import Clock

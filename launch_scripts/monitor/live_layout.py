@@ -23,7 +23,7 @@ from launch_scripts.monitor.styles import FOLLOWED_ENTITY, HINT, HUES, Level, Lo
 from launch_scripts.monitor.terrain_mesh import TerrainMesh
 from launch_scripts.observe import fact_table as facts
 from launch_scripts.observe import palette
-from launch_scripts.observe.run_alarms import KINDS
+from launch_scripts.observe.alarms import KINDS
 from launch_scripts.observe.run_state import RunState
 from swarm.config.scenario import Scenario
 from swarm.runtime.role_setup import RoleSetup

@@ -21,8 +21,8 @@ from launch_scripts.monitor import styles
 from launch_scripts.monitor.rerun_outputs import LABEL_COLOUR, Pen, RateLimit, Strips, even, ragged, screen, shown
 from launch_scripts.monitor.styles import ALARM_COLOUR, FOLLOWED_ENTITY, Level, Looks, dimmed
 from launch_scripts.monitor.terrain_mesh import Bytes, Floats, TerrainMesh
+from launch_scripts.observe.alarms import Alarm
 from launch_scripts.observe.latest_messages import LatestState, VehicleColumns
-from launch_scripts.observe.run_alarms import Alarm
 from launch_scripts.observe.run_state import RunState
 from launch_scripts.observe.summed_counts import percent
 from shared_map.replication.interest import MarkFilter

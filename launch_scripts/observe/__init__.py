@@ -10,10 +10,11 @@
 | summed_counts.py   | `Counts`: sums of all processes, with the certified gap, and the load of each            |
 | run_state.py       | `RunState`: the run at an instant; `state_of` makes one                                  |
 | fact_table.py      | `FACTS`, `TARGET_FACTS`: name, label, unit and text of each fact                         |
-| run_alarms.py      | `Alarm`, `KINDS`: what went wrong, where, since when, and whether it is over             |
-| run_recorder.py    | `Recorder`: figures, tracks, routes, captures, notes over time, in bounded memory; it    |
+| alarms.py          | `Alarm`, `KINDS`: what went wrong, where, since when, and whether it is over             |
+| recorder.py        | `Recorder`: figures, tracks, routes, captures, notes over time, in bounded memory; it    |
 |                    | makes the numbers of the report, and results per target, group and vehicle               |
 | run_folder.py      | the folder of a run, and how files are written whole                                     |
+| local_runs.py      | the runs of this user on this machine, each by a small file                              |
 | palette.py         | how pictures and the live view look                                                      |
 
 A new fact is one row in `FACTS`, and appears everywhere. Facts are counted by the process that does the counted

@@ -10,7 +10,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
-from launch_scripts.observe.run_alarms import SERIOUS, Alarm
+from launch_scripts.observe.alarms import SERIOUS, Alarm
 from launch_scripts.observe.run_state import RunState, TargetLine
 from launch_scripts.observe.summed_counts import CertifiedGap, gap_text, percent
 from launch_scripts.plain_text import Duration, first_of, number_of

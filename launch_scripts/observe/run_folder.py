@@ -14,7 +14,7 @@ import platform
 from pathlib import Path
 from typing import Any
 
-from launch_scripts.observe.run_registry import register, registered
+from launch_scripts.observe.local_runs import register, registered
 from swarm.config.input_files import FileKind, read_text
 from swarm.config.scenario import Scenario
 from swarm.config.write import scenario_text

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from launch_scripts.observe.alarms import Alarm, alarms_of, starts
 from launch_scripts.observe.latest_messages import LatestState, VehicleColumns
-from launch_scripts.observe.run_alarms import Alarm, alarms_of, starts
 from launch_scripts.observe.summed_counts import CertifiedGap, certified_gap, gaps_to
 from launch_scripts.plain_text import Duration, plain
 from swarm.clock import NS_PER_S

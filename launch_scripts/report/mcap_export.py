@@ -38,8 +38,8 @@ from launch_scripts.gateways.ros2.ros_messages import (
     ros_name,
 )
 from launch_scripts.gateways.ros2.ros_types import RosTypes, types_of
+from launch_scripts.observe.alarms import Alarm
 from launch_scripts.observe.palette import GROUPS, colours_of_groups, rgb
-from launch_scripts.observe.run_alarms import Alarm
 from launch_scripts.observe.run_folder import REPORT_FILE, read_report
 from launch_scripts.report.gis_formats import turns_of
 from launch_scripts.report.report_and_tracks import GROUND_PACE_FILE, GroundPace, RunTracks, Track, read_ground

@@ -26,8 +26,8 @@ from numpy.typing import NDArray
 
 from launch_scripts.observe.latest_messages import MarkedCells
 from launch_scripts.observe.palette import image_bytes
+from launch_scripts.observe.recorder import Recorder
 from launch_scripts.observe.run_folder import REPORT_FILE, ended
-from launch_scripts.observe.run_recorder import Recorder
 from shared_map.learning.learned_factors import factors_in, learned_kinds
 from shared_map.terrain.pyramid import Level
 from shared_map.terrain.terrain import Terrain

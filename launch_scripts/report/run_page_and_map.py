@@ -32,9 +32,9 @@ from PIL import Image
 from scipy.ndimage import binary_erosion
 
 from launch_scripts.observe import palette
+from launch_scripts.observe.alarms import Alarm
 from launch_scripts.observe.fact_table import WELL, count, grouped, left_behind
 from launch_scripts.observe.palette import colours_of_groups, rgb, round_length, said_length
-from launch_scripts.observe.run_alarms import Alarm
 from launch_scripts.observe.run_folder import REPORT_FILE, SCENARIO_FILE, read_report
 from launch_scripts.observe.summed_counts import percent
 from launch_scripts.report.plots_and_cards import PLOTS, STYLE, cards, draw_plot, halo, headline, saved

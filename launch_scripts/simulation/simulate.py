@@ -18,8 +18,8 @@ from hashlib import blake2s
 from pathlib import Path
 from typing import Any, TextIO
 
+from launch_scripts.observe.recorder import Recorder
 from launch_scripts.observe.run_observer import RECORDED, RunObserver
-from launch_scripts.observe.run_recorder import Recorder
 from launch_scripts.process_table import SIMULATED_ROLES, STOP_ORDER, ProcessSpec, processes_of
 from launch_scripts.simulation.faults import OBSERVER, RELINK_S, FaultPlan, FaultyLinks
 from launch_scripts.simulation.simulated_process import EPOCH_NS, Node

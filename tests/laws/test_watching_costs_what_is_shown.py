@@ -11,8 +11,8 @@ from support.swarm_model import SwarmModel
 from support.target_reports import fleet
 
 from launch_scripts.launcher.watcher import Watcher
+from launch_scripts.observe.recorder import Recorder
 from launch_scripts.observe.run_observer import RECORDED
-from launch_scripts.observe.run_recorder import Recorder
 from launch_scripts.web.http_server import Audience
 from swarm.bus.memory_bus import MemoryBus
 from swarm.wire.messages.vehicles import Followed

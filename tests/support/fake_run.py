@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from launch_scripts.observe.run_recorder import Recorder
+from launch_scripts.observe.recorder import Recorder
 from launch_scripts.report.report_and_tracks import make_report, write_report
 from launch_scripts.simulation.simulate import Simulation
 from launch_scripts.simulation.simulated_process import EPOCH_NS as BEGAN_NS

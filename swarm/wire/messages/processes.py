@@ -53,7 +53,7 @@ class RunInfo(Message, frozen=True, kw_only=True, tag=schema_of("run")):
 class Alarm(msgspec.Struct, frozen=True, kw_only=True):
     """A process's notice to people that watch the run: a collision, an author beyond its quota.
 
-    kind      a word of `launch_scripts.observe.run_alarms.KINDS`; any other is shown as it is
+    kind      a word of `launch_scripts.observe.alarms.KINDS`; any other is shown as it is
     about     the process, target, author or vehicle that it is about
     since_ns  when it began; over_ns when it was over, None while it lasts
     """

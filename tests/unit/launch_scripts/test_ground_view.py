@@ -39,7 +39,7 @@ from launch_scripts.monitor.rerun_outputs import Pen, in_markdown, shown
 from launch_scripts.monitor.terrain_mesh import Bytes, Floats, TerrainMesh
 from launch_scripts.observe import fact_table as facts
 from launch_scripts.observe.palette import rgb
-from launch_scripts.observe.run_recorder import Recorder
+from launch_scripts.observe.recorder import Recorder
 from launch_scripts.report.report_and_tracks import make_report, write_report
 from launch_scripts.report.run_page_and_map import QUICKER, SLOWER, learned_pixels
 from shared_map.cost_map import CostMap

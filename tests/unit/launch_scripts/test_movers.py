@@ -29,8 +29,8 @@ from launch_scripts.monitor.movers_view import (
 from launch_scripts.monitor.rerun_outputs import Pen, RateLimit, Strips
 from launch_scripts.monitor.styles import HUES, LOST_COLOUR, Looks
 from launch_scripts.monitor.terrain_mesh import TerrainMesh
+from launch_scripts.observe.alarms import KINDS, Alarm
 from launch_scripts.observe.latest_messages import LatestState, RunPlan, VehicleColumns
-from launch_scripts.observe.run_alarms import KINDS, Alarm
 from launch_scripts.observe.run_state import state_of
 from launch_scripts.plain_text import Duration
 from swarm.clock import NS_PER_S

@@ -16,8 +16,8 @@ from support import fake_run
 from launch_scripts.launcher.run_options import SCENARIOS, find_scenario
 from launch_scripts.observe.fact_table import verdict
 from launch_scripts.observe.latest_messages import VehicleColumns
+from launch_scripts.observe.recorder import Driven, Recorder
 from launch_scripts.observe.run_folder import begin_run, ended, find_run, point_last, read_report
-from launch_scripts.observe.run_recorder import Driven, Recorder
 from launch_scripts.report import plots_and_cards as plots
 from launch_scripts.report import run_page_and_map as picture
 from launch_scripts.report.report_and_tracks import TABLES, make_report, read_tracks, write_report

@@ -21,7 +21,7 @@ from support.command import Swarm
 from support.fake_run import BEGAN_NS, little_scenario, played
 from support.map_strategies import set_of
 
-from launch_scripts.observe.run_recorder import BegunRoute, Recorder
+from launch_scripts.observe.recorder import BegunRoute, Recorder
 from launch_scripts.report.gis_formats import in_degrees, write_layers
 from launch_scripts.report.report_and_tracks import TRACKS_FILE, Track, packed_tracks, read_tracks, tracks_in
 from launch_scripts.report.run_gis_layers import ENDINGS, mark_layer, target_tracks, vehicle_tracks

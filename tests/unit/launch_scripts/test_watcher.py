@@ -14,8 +14,8 @@ from support.target_reports import fleet
 
 from launch_scripts.launcher.run_options import UpOptions
 from launch_scripts.launcher.watcher import OwnPart, Watcher
-from launch_scripts.observe.run_alarms import EVIDENCE, KINDS, alarms_of
-from launch_scripts.observe.run_recorder import Recorder
+from launch_scripts.observe.alarms import EVIDENCE, KINDS, alarms_of
+from launch_scripts.observe.recorder import Recorder
 from launch_scripts.process_table import ProcessSpec, processes_of
 from swarm.bus.bus import Appeared, Disappeared
 from swarm.clock import NS_PER_S

@@ -15,7 +15,7 @@ from support.map_strategies import set_of
 from launch_scripts.launcher.terminal_tables import plain_line
 from launch_scripts.observe import fact_table as facts
 from launch_scripts.observe.latest_messages import LatestState, plan_of
-from launch_scripts.observe.run_recorder import BegunRoute, Recorder, Sampling, Thinned
+from launch_scripts.observe.recorder import BegunRoute, Recorder, Sampling, Thinned
 from launch_scripts.observe.summed_counts import CertifiedGap
 from swarm.clock import NS_PER_S
 from swarm.config.load import parse_scenario
@@ -405,9 +405,9 @@ def test_tracks_forget_every_second_sampling_instead_of_growing() -> None:
 
 def test_a_run_of_a_day_takes_no_more_memory_than_one_of_an_hour(monkeypatch: pytest.MonkeyPatch) -> None:
     """The size of a recorder by its own lists: captures, samples and places are all bounded."""
-    monkeypatch.setattr("launch_scripts.observe.run_recorder._CAPTURES_KEPT", 512)
-    monkeypatch.setattr("launch_scripts.observe.run_recorder._MOST_SAMPLES", 512)
-    monkeypatch.setattr("launch_scripts.observe.run_recorder._MOST_PLACES", 2000)
+    monkeypatch.setattr("launch_scripts.observe.recorder._CAPTURES_KEPT", 512)
+    monkeypatch.setattr("launch_scripts.observe.recorder._MOST_SAMPLES", 512)
+    monkeypatch.setattr("launch_scripts.observe.recorder._MOST_PLACES", 2000)
     recorder = Recorder(scenario(), GRID)
 
     def record(from_s: int, until_s: int) -> int:
