@@ -58,6 +58,7 @@ FIRST: tuple[Kernel | StepKernel, ...] = (
     StepKernel(queue_wide_buckets.grow_by_wide_buckets, None),
     parents_from_costs.untie_parents,
     StepKernel(cut_trees.box_of, None),
+    StepKernel(cut_trees.point_routes, None),
     cell_costs.pad_cell_costs,
     cell_costs.changed_cells,
     route_walk.drive_rests,

@@ -381,16 +381,28 @@ class TargetTree:
         return self.ready
 
     def _nearest(self, target_cell: int) -> int | None:
-        """The open cell nearest to a lethal one, of those from which the last tree led; None if none is near."""
-        window = self._grid.around(target_cell, _NEAR_CELLS)
-        rows, cols = np.mgrid[window.row0 : window.row1, window.col0 : window.col1].reshape(2, -1)
-        padded = (rows + 1) * self._costs.stride + cols + 1
-        open_ = np.isfinite(self._costs.cell_cost[padded])
-        led = open_ & np.isfinite(self._tree.cost_at(padded)) if self._tree.root >= 0 else open_
+        """The open cell nearest to a lethal one, of those from which the last tree led, or of all if it led from
+        none near; of equals the first of the grid. None if none is near.
+
+        It looks at a circle that holds the last answer, and at wider ones if no tree leads from there any more, so
+        that a target which moves over water costs what lies between it and the shore.
+        """
         row, col = self._grid.row_col(target_cell)
-        away = np.where(led if led.any() else open_, (rows - row) ** 2 + (cols - col) ** 2, np.inf)
-        best = int(away.argmin())
-        return self._grid.cell(int(rows[best]), int(cols[best])) if np.isfinite(away[best]) else None
+        last = None if self.lethal_target is None else self.lethal_target.nearest
+        first = 1 if last is None else self._grid.distance_cells(target_cell, last) * 3 // 2 + 1
+        costs = self._costs.cell_cost.reshape(-1, self._costs.stride)[1:-1, 1:-1]
+        for half in (*(first << n for n in range(8) if first << n < _NEAR_CELLS), _NEAR_CELLS):
+            window = self._grid.around(target_cell, half)
+            rows, cols = np.nonzero(costs[window.row0 : window.row1, window.col0 : window.col1] < np.inf)
+            rows, cols = rows + window.row0, cols + window.col0
+            away = (rows - row) ** 2 + (cols - col) ** 2
+            near = np.flatnonzero((away <= half**2) | (half == _NEAR_CELLS))
+            led = near[self._leads((rows[near] + 1) * self._costs.stride + cols[near] + 1)]
+            chosen = led if led.size or half < _NEAR_CELLS else near
+            if chosen.size:
+                best = int(chosen[away[chosen].argmin()])
+                return self._grid.cell(int(rows[best]), int(cols[best]))
+        return None
 
     def _follow(self, target_cell: int, changes: Changes | None) -> Update:
         """Brings the tree up to date with the map, then with its target: decide, and do it."""
@@ -566,6 +578,8 @@ class TargetTree:
                 return
             self._take_grown(self._tree.root)
             self._too_far |= not self._is_whole and self._without_path(missing).size > 0
+        if not self._is_whole and isinstance(self._tree, CostToGoTree):
+            self._tree.point(starts)
         self._note(starts)
 
     def expect(self, cells: Any) -> None:
@@ -587,10 +601,16 @@ class TargetTree:
             starts, _CELLS_PER_SQUARE * int(max(np.abs(rows - row).max(), np.abs(cols - col).max())) ** 2
         )
 
+    def _leads(self, starts: NDArray[np.int64]) -> NDArray[np.bool_]:
+        """Returns from which of some padded, passable cells the tree leads to its root."""
+        if not self._is_whole:
+            return self._growth.cost[starts] < np.inf
+        root = self._tree.root
+        return (self._tree.parent[starts] != NONE) | (starts == self._costs.pad(root)) if root >= 0 else starts < 0
+
     def _without_path(self, starts: NDArray[np.int64]) -> NDArray[np.int64]:
         """Those of some padded cells from which the tree leads nowhere, or not yet."""
-        root = self._costs.pad(self._tree.root)
-        without: NDArray[np.int64] = starts[(self._tree.parent[starts] == NONE) & (starts != root)]
+        without: NDArray[np.int64] = starts[~self._leads(starts)]
         return without
 
     def _open(self, cells: Any) -> NDArray[np.int64]:

@@ -55,6 +55,10 @@ class BusError(SwarmError):
     exit_code = 4
 
 
+class NoAnswerError(BusError):
+    """No process has answered a question, nor refused it: none serves it, or the one which did has just ended."""
+
+
 class RunMismatchError(SwarmError):
     """Two processes in one namespace belong to different runs, or have different terrain or cost rules."""
 

@@ -6,6 +6,7 @@ import json
 import math
 import time
 from dataclasses import dataclass
+from fnmatch import fnmatch
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeVar
 
@@ -20,7 +21,7 @@ from swarm.config.vehicle_classes import GROUND
 from swarm.errors import BusError, ConfigError, TerrainError
 from swarm.grid import walk
 from swarm.places import Place, cell_of, fields_of, written
-from swarm.runtime.operator import replies_to
+from swarm.runtime.operator import AGAIN_S, replies_to
 from swarm.wire.access import OPERATOR
 from swarm.wire.codec import encode_json
 from swarm.wire.messages import Message
@@ -100,7 +101,7 @@ def ask_planner(bus: Bus, where: object, target: str, start: Place, vehicle_clas
     request = RouteRequest(row=row, col=col, vehicle_class=vehicle_class)
     began_s = time.monotonic()
     try:
-        reply = _reply(bus, ROUTE, request, RouteReply, "", target=target)
+        reply = _reply(bus, ROUTE, request, RouteReply, f"planner-{target}", "", target=target)
     except BusError:
         needed = {process.partition("planner-")[2] for member in ask_run(bus) for process in member.crew}
         there = choice(target, sorted(needed - {""}), " there are: ")
@@ -116,7 +117,7 @@ def ask_place(bus: Bus, where: object, start: Place, end: Place, vehicle_class: 
     missing = f"no process plans routes to places {where}: its scenario needs planner.places = true"
     began_s = time.monotonic()
     while True:
-        found = _reply(bus, PLACE_ROUTE, request, PlaceRouteReply, missing)
+        found = _reply(bus, PLACE_ROUTE, request, PlaceRouteReply, "places-*", missing)
         spent_s = time.monotonic() - began_s
         if found.status != "growing" or spent_s > _TIMEOUT_S:
             break
@@ -130,16 +131,24 @@ def ask_place(bus: Bus, where: object, start: Place, end: Place, vehicle_class: 
     return Answer(reply, frame, cell, spent_s * 1e3)
 
 
-def _reply(bus: Bus, topic: Topic, request: Message, kind: type[M], missing: str, **fields: Any) -> M:
-    """The reply of this kind to a question. Raises ConfigError if it is refused, BusError(missing) without one."""
-    asker = asker_of(OPERATOR, "command")
-    replies, failure = replies_to(bus, topic, request, _TIMEOUT_S, asker=asker, **fields)
-    for reply in replies:
-        if isinstance(reply, kind):
-            return reply
-    if failure is not None and failure != "timeout":
-        raise ConfigError(failure)
-    raise BusError(missing)
+def _reply(bus: Bus, topic: Topic, request: Message, kind: type[M], server: str, missing: str, **fields: Any) -> M:
+    """The reply of this kind to a question. Raises ConfigError if it is refused, BusError(missing) without one.
+
+    server  the name of the process that answers; `*` stands for any id. If the run needs one, the question is
+            repeated: a standby, or the next life, may be about to take over
+    """
+    asker, until_s = asker_of(OPERATOR, "command"), time.monotonic() + _TIMEOUT_S
+    while True:
+        replies, failure = replies_to(bus, topic, request, _TIMEOUT_S, asker=asker, **fields)
+        for reply in replies:
+            if isinstance(reply, kind):
+                return reply
+        if failure is not None and failure != "timeout":
+            raise ConfigError(failure)
+        needed = [name for member in ask_run(bus) for name in member.crew if fnmatch(name, server)]
+        if not needed or time.monotonic() > until_s:
+            raise BusError(f"{needed[0]} does not answer" if needed else missing)
+        time.sleep(AGAIN_S)
 
 
 def as_json(answer: Answer) -> str:

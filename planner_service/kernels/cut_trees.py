@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 
 from planner_service.kernels.decorators import helper, kernel
-from planner_service.kernels.layout import BOX, GRID, INF, RULE_OCTILE, SQRT2_EXACT, diagonal_length
+from planner_service.kernels.layout import BOX, GRID, INF, NONE, RULE_OCTILE, SQRT2_EXACT, diagonal_length
 
 _DETOUR = 0.4142135
 """Least that a diagonal octile step costs beyond a straight one, in straight ones."""
@@ -91,6 +91,43 @@ def stays_exact(grid, box, crop, cells, before, bound, route, known, mark):
     return level, stands
 
 
+@helper
+def _cheapest_way(grid, cost, beside, v, at):
+    """The direction of the least offer to padded cell `v`, which is cell `at` of `cost`, and what direction k adds
+    to that is beside[k]; of equals the first as in `parents_from_costs`. NONE if there is none."""
+    cell_cost, offsets, _, rule, corners = grid
+    lengths = np.float32(1.0), diagonal_length(rule)
+    best, way = INF, NONE
+    for j in range(8):
+        k = 2 * j if j < 4 else 2 * j - 7
+        key = cost[at + beside[k]] + cell_cost[v + offsets[k]] * lengths[k & 1]
+        if key < best:
+            shut = max(cell_cost[v + offsets[k - (k & 1)]], cell_cost[v + offsets[(k + 1) & 7]]) == INF
+            if not (k & 1 and shut and not corners):
+                best, way = key, np.uint8(k)
+    return way
+
+
+@kernel(f"({GRID}, f4[::1], i8, i8[::1], u1[::1], u4[::1], i8)")
+def point_routes(grid, cost, root, starts, parent, pointed, count):
+    """Writes the parents of the cells on the routes from padded, passable cells to the root, of those which have
+    one.
+
+    cost     of a growth that has stopped: exact, inf where a cell has none, WALL where it is lethal
+    pointed  uint32 (size,), the cells which have a parent, `count` until now. Those with new ones are put behind
+    Returns how many there are.
+    """
+    offsets = grid[1]
+    for i in range(starts.size):
+        v = starts[i]
+        while cost[v] < INF and v != root and parent[v] == NONE:
+            parent[v] = _cheapest_way(grid, cost, offsets, v, v)
+            pointed[count] = v
+            count += 1
+            v += offsets[parent[v]]
+    return count
+
+
 @kernel(f"({GRID}, {BOX}, f4[::1], f4[::1], UniTuple(i8, 3), u1[::1])")
 def walk_by_costs(grid, box, crop, time_cost, ends, directions):
     """Writes the directions of a cheapest route by costs alone; of equals the first as in `parents_from_costs`.
@@ -101,25 +138,17 @@ def walk_by_costs(grid, box, crop, time_cost, ends, directions):
     Returns the steps, or -1 if it does not end at the root within as many as have room; diagonal ones of the first
     part; what it takes, s, all and the first part.
     """
-    cell_cost, offsets, stride, rule, corners = grid
+    _, offsets, stride, rule, _ = grid
     v, root, part = ends
     row0, col0, _, col1 = box
     width = col1 - col0
     beside = (-width, 1 - width, 1, width + 1, width, width - 1, -1, -width - 1)
     at = (v // stride - row0) * width + v % stride - col0
-    lengths = np.float32(1.0), diagonal_length(rule)
     n = slanted = 0
     driven = first = 0.0
     while v != root:
-        best = INF
-        way = -1
-        for j in range(8):
-            k = 2 * j if j < 4 else 2 * j - 7
-            key = crop[at + beside[k]] + cell_cost[v + offsets[k]] * lengths[k & 1]
-            shut = max(cell_cost[v + offsets[k - (k & 1)]], cell_cost[v + offsets[(k + 1) & 7]]) == INF
-            if key < best and not (k & 1 and shut and not corners):
-                best, way = key, k
-        if way < 0 or n == directions.size:
+        way = _cheapest_way(grid, crop, beside, v, at)
+        if way == NONE or n == directions.size:
             return -1, 0, 0.0, 0.0
         directions[n] = way
         n += 1

@@ -20,6 +20,7 @@ from planner_service.kernels import stride_growth
 from planner_service.kernels.cell_costs import cut_window, find_rim, merge_window
 from planner_service.kernels.climbs import climbs_in
 from planner_service.kernels.costs_from_parents import Walk, make_walk, mend
+from planner_service.kernels.cut_trees import point_routes
 from planner_service.kernels.layout import NONE, Labels, PaddedGrid, step_offsets
 from planner_service.kernels.lower_bounds import WindowBound
 from planner_service.kernels.parents_from_costs import point_to_parents
@@ -48,9 +49,9 @@ class CostToGoTree:
         self.cost_grid = cost_grid
         """The map that the tree lies on. A caller that changes it calls `repair`, or rebuilds the tree."""
         self.cost: Floats = np.empty(0, np.float32)
-        """float32, padded, s: a cell's cost-to-go is at most this plus `offset`; inf where there is no path. Empty
-        before the first growth. `grow` and `take` set it, `move`, `mend`, `grow_strides`, `tighten` and `repair`
-        change it."""
+        """float32, padded, s: a cell's cost-to-go is at most this plus `offset`; inf where there is no path. In a
+        tree that is not whole, WALL where a cell is lethal. Empty before the first growth. `grow` and `take` set
+        it, `move`, `mend`, `grow_strides`, `tighten` and `repair` change it."""
         self.parent: NDArray[np.uint8] = np.empty(0, np.uint8)
         """uint8, padded: direction of each cell's next cell; NONE at the root and where there is no path."""
         self.root = -1
@@ -65,9 +66,10 @@ class CostToGoTree:
         """s; no stored cost exceeds it. A growth sets it, a repair may raise it."""
         self.bound = math.inf
         """s; a cell without a cost has no path, or costs at least this. inf for a whole tree: then it has no path.
-        Only `take_grown` makes a tree that is not whole, which is exact; it can be read, and be grown again."""
-        self._box = 0, 0, 0, 0
-        """Box of the cells that have a cost, if the tree is not whole."""
+        Only `take_grown` makes a tree that is not whole, which is exact; it can be read where `point` was called,
+        and be grown again."""
+        self._pointed, self._parents = np.empty(0, np.uint32), 0
+        """Scratch: the padded cells which `point` gave a parent, and how many."""
         self.window_bound: WindowBound | None = None
         """Bound proven by the last window, as long as its root is the tree's. `move` sets it, a growth resets it,
         and so does the owner (to None) when a cell gets cheaper, as it is a lower bound."""
@@ -85,7 +87,7 @@ class CostToGoTree:
         """Grows the whole tree of a cell, exactly. Raises OutsideGridError if it is none of the grid, ValueError if
         it is lethal."""
         self.cost_grid.check_root(root)
-        if not self.cost.size:
+        if not self.cost.size or self.bound < math.inf:
             self.cost = np.empty(self.cost_grid.size, np.float32)
             self.parent = np.full(self.cost_grid.size, NONE, np.uint8)
         self.reach = self.cost_grid.grow(self.cost_grid.pad(root), self.cost, self.parent)
@@ -106,23 +108,28 @@ class CostToGoTree:
         self.mend()
 
     def take_grown(self, root: int, growth: PartialGrowth) -> None:
-        """Becomes the tree in hand of a growth that has stopped: exact as far as that went. The work follows the
-        size of that tree, and of the one before."""
+        """Becomes the tree in hand of a growth that has stopped, exact as far as that went: its costs are a view of
+        the growth's, and its parents are left to `point`, unless it is whole."""
         grid = self.cost_grid
-        if not self.cost.size or self.bound == math.inf:
-            self.cost = np.full(grid.size, np.inf, np.float32)
+        if not self.parent.size or self.bound == math.inf:
             self.parent = np.full(grid.size, NONE, np.uint8)
-        for array, nothing in ((self.cost, np.inf), (self.parent, NONE)):
-            row0, col0, row1, col1 = self._box
-            array.reshape(-1, grid.stride)[row0:row1, col0:col1] = nothing
-        self._box = row0, col0, row1, col1 = growth.box()
-        np.abs(growth.inside(self._box), out=self.cost.reshape(-1, grid.stride)[row0:row1, col0:col1])
-        unpadded = row0 - 1, col0 - 1, row1 - 1, col1 - 1
-        point_to_parents(grid.padded, grid.climbs, self.cost, growth.root, unpadded, self.parent)
+            self._pointed = np.empty(grid.size, np.uint32)
+        else:
+            self.parent[self._pointed[: self._parents]] = NONE
+        self.cost, self._parents = growth.cost, 0
+        if growth.bound == math.inf:
+            self.cost, whole = np.abs(growth.cost), (0, 0, grid.grid.rows, grid.grid.cols)
+            point_to_parents(grid.padded, grid.climbs, self.cost, growth.root, whole, self.parent)
         self.reach = growth.reach
         self._ways_changed()
         self._become_exact(root)
         self.bound = growth.bound
+
+    def point(self, starts: Cells) -> None:
+        """Finds the parents along the routes from padded, passable cells of a tree that is not whole: from those
+        which have a cost. The work follows the length of the routes, not the size of the tree."""
+        labels = self.cost, self.cost_grid.pad(self.root), starts, self.parent
+        self._parents = point_routes(self.cost_grid.padded, *labels, self._pointed, self._parents)
 
     def merge_grown(self, growth: PartialGrowth) -> Window:
         """Lowers the costs to those of a growth from the same root that has stopped, whose cells become exact.

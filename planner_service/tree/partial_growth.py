@@ -180,15 +180,12 @@ class PartialGrowth:
         return inner
 
     def _empty(self, inner: Floats) -> None:
-        self.cost[self.root] = 1.0  # for 0 times inf is no number
+        self.cost[self.root] += 1.0  # for 0 times inf is no number; WALL, if it is lethal by now, stays
         np.multiply(inner, np.float32(np.inf), out=inner)  # what is lethal stays WALL, which is -inf
         self.root = -1
 
     def learn(self, changes: Changes) -> None:
-        """The map has changed: the tree in hand is forgotten."""
-        if not changes.cells.size:
-            return
-        self.forget()
+        """The map has changed: the tree in hand is that of the map as it was, and cannot go on."""
         if self.cost.size:
             self.cost[changes.cells] = np.where(changes.after < np.inf, np.float32(np.inf), WALL)
 

@@ -21,8 +21,8 @@ from swarm.client.session import Session, SwarmThread
 from swarm.client.terrain_frame import Frame, Point
 from swarm.client.vehicle import Vehicle
 from swarm.clock import Clock, MonotonicClock
-from swarm.errors import BusError, ConfigError, RunMismatchError, SwarmError
-from swarm.runtime.operator import Acknowledged, Operator, checked, replies_to
+from swarm.errors import BusError, ConfigError, NoAnswerError, RunMismatchError, SwarmError
+from swarm.runtime.operator import AGAIN_S, Acknowledged, Operator, checked, replies_to
 from swarm.wire.access import OPERATOR, Authenticator
 from swarm.wire.messages import WIRE_VERSION, Nothing
 from swarm.wire.messages.orders import GiveOrder, Order, SendVehicle, Then, VehicleGoals, Zone, ZoneOrder
@@ -282,11 +282,13 @@ class Swarm:
         return self._session.ask_route(target, self.frame.cell(x_m, y_m), vehicle_class, timeout_s)
 
     def route(self, start_m: Point, goal_m: Point, *, vehicle_class: str = GROUND, timeout_s: float = 5.0) -> Route:
-        """The best route between two places, (x_m, y_m) each. Waits until it is known, `timeout_s` at most.
+        """The best route between two places, (x_m, y_m) each. Waits until it is known, `timeout_s` at most, also
+        while the process that plans to places is replaced.
 
         Raises ConfigError on a place outside the terrain, BusError where no process plans to places.
         """
         until_s = time.monotonic() + timeout_s
+        served = any(name.startswith("places-") for name in self._session.run.crew)
         start, goal = self.frame.cell(*start_m), self.frame.cell(*goal_m)
         request = PlaceRouteRequest(to=goal, cells=[start], vehicle_class=vehicle_class)
         while True:
@@ -296,6 +298,10 @@ class Swarm:
                 reply: PlaceRouteReply = self._session.answers(waiting, left_s)[0]
                 if reply.status != "growing" or time.monotonic() >= until_s:
                     return Route.of(self.frame, reply.routes[0], reply)
+            except NoAnswerError:
+                if not served or time.monotonic() >= until_s:
+                    raise
+                time.sleep(AGAIN_S)
             except (ValueError, IndexError) as error:
                 raise BusError(f"the planner of places answers nonsense: {error}") from error
 

@@ -17,7 +17,7 @@ from swarm.client.route import Route
 from swarm.client.terrain_frame import Frame, number
 from swarm.clock import NS_PER_S, Clock
 from swarm.config.explain import choice
-from swarm.errors import BusError, ConfigError, ProtocolError, RunMismatchError, SwarmError
+from swarm.errors import BusError, ConfigError, NoAnswerError, ProtocolError, RunMismatchError, SwarmError
 from swarm.wire.codec import M, decode, encode
 from swarm.wire.fields import check_id
 from swarm.wire.messages import Message, Nothing
@@ -257,9 +257,10 @@ class Session:
                     waiting, found = self._asked.pop(tag)
                     if replies:
                         self.call(lambda: waiting.set_result(found))
+                    elif failure and failure != "timeout":
+                        self.call(lambda: waiting.set_exception(BusError(f"no answer: {failure}")))
                     else:
-                        what = f"no answer: {failure}" if failure and failure != "timeout" else "no process answers"
-                        self.call(lambda: waiting.set_exception(BusError(what)))
+                        self.call(lambda: waiting.set_exception(NoAnswerError("no process answers")))
                 case LinkChanged(up=up):
                     self.connected = up
                     if up:

@@ -48,6 +48,8 @@ _ORDER_S = 5.0
 """Longest wait for a keeper, which answers once the order is on its disk."""
 OBEY_S = 3.0
 """Longest wait for all to obey. A process that missed an order gets it from a keeper a second later."""
+AGAIN_S = 0.2
+"""From a question that no process answered to the next: a standby takes over within a second."""
 _MOST_SETS = DIGEST_ROW_BYTES << 13
 """Most bytes of a zone's sets that are asked about, so that a process looks for them within a tick: those of the
 first 8,192 tiles. A larger zone's other tiles arrive with them."""
