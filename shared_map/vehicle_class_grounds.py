@@ -185,7 +185,7 @@ def _load(folder: Path, key: str, scenario: Scenario, common: Terrain, name: str
     if meta is None:
         return None
     shape = common.grid.shape
-    flight_m = store.read_array(folder, "flight", shape, np.float32) if flies(scenario, name) else None
+    flight_m = store.read_array(folder, "flight", meta, shape, np.float32) if flies(scenario, name) else None
     terrain = replace(
         common,
         **store.read_ground(folder / _META, meta, common.elevation_m if flight_m is None else flight_m),
@@ -193,8 +193,8 @@ def _load(folder: Path, key: str, scenario: Scenario, common: Terrain, name: str
         zones=common.zones if flight_m is None else (),
         least_s_per_m=least_pace(class_named(scenario, name)),
     )
-    truth = store.read_array(folder, "truth", shape, np.float32)
-    return ClassGround(terrain, truth, store.read_array(folder, "homes", shape, np.bool_))
+    truth = store.read_array(folder, "truth", meta, shape, np.float32)
+    return ClassGround(terrain, truth, store.read_array(folder, "homes", meta, shape, np.bool_))
 
 
 # --- marks as each class reads them ---------------------------------------------------------------------------

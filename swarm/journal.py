@@ -84,11 +84,7 @@ class Lock:
         make_folder(path.parent)
         with writing(path):
             self._file = os.open(f"{path}.lock", os.O_CREAT | os.O_RDWR, 0o600)
-        try:
-            fcntl.flock(self._file, fcntl.LOCK_EX | (0 if waits else fcntl.LOCK_NB))
-        except OSError as error:
-            self.close()
-            raise StoreError(f"{path} is in use {in_use}") from error
+        _lock(path, self._file, in_use, waits=waits)
 
     def witness(self, seal: Seal) -> None:
         with writing(self._path):
@@ -98,6 +94,14 @@ class Lock:
         if self._file >= 0:
             os.close(self._file)
             self._file = -1
+
+
+def _lock(path: Path, file: int, in_use: str, *, waits: bool) -> None:
+    """Locks an open file that belongs to a store."""
+    try:
+        fcntl.flock(file, fcntl.LOCK_EX | (0 if waits else fcntl.LOCK_NB))
+    except OSError as error:
+        raise StoreError(f"{path} is in use {in_use}") from error
 
 
 def witness_of(path: Path, kind: str) -> Seal | None:
@@ -132,7 +136,8 @@ class Journal:
     """Appends records to a file, and goes over to a spare one with what still counts when it is full.
 
     Both files have their space beforehand, so that a full disk keeps no owner from its records for long, and a life
-    that begins meanwhile from none. The file is locked for as long as the process lives.
+    that begins meanwhile from none. The file is locked for as long as the process lives, and so is the one beside
+    it, which may be deleted. A folder that is gone is made again for the next file.
 
     kind      names the format; a file of another one is refused
     live      the bodies of the records that still count
@@ -169,7 +174,7 @@ class Journal:
         self._lock = Lock(path, in_use, waits=waits)
         try:
             if path.exists():
-                self._read()
+                self._read(in_use, waits=waits)
         except SwarmError:
             self.close()
             raise
@@ -189,9 +194,14 @@ class Journal:
     def reserve(self) -> str | None:
         """Makes the spare file. Returns the reason if that fails, None if there is one."""
         if self._spare >= 0:
-            return None
+            with suppress(OSError):
+                if os.path.samestat(self._spare_path.stat(), os.fstat(self._spare)):
+                    return None
+            os.close(self._spare)  # it has been deleted, or moved away
+            self._spare = -1
         size = max(self._least, 4 * (SEAL_BYTES + sum(_RECORD.size + len(body) for body in self._live())))
         try:
+            self._path.parent.mkdir(parents=True, exist_ok=True)
             spare = os.open(self._spare_path, os.O_CREAT | os.O_RDWR, 0o600)
             try:
                 if os.fstat(spare).st_size < size:
@@ -241,8 +251,11 @@ class Journal:
         self._file = self._spare = -1
         self._lock.close()
 
-    def _read(self) -> None:
+    def _read(self, in_use: str, *, waits: bool) -> None:
         """Reads the records of the file, and goes on behind them."""
+        with writing(self._path):
+            self._file = os.open(self._path, os.O_RDWR)
+        _lock(self._path, self._file, in_use, waits=waits)
         witness = witness_of(self._path, self._seal.kind)
         data = read_bytes(self._path, self._kind)
         seal = read_seal(data, self._seal.kind)
@@ -269,8 +282,6 @@ class Journal:
             )
         found = seal._replace(last=number, digest=digest)
         check_witness(self._path, witness, found, digests.get)
-        with writing(self._path):
-            self._file = os.open(self._path, os.O_RDWR)
         self._seal, self._at, self._size = found, at, len(data)
         self._synced = False  # a record that is whole counts from now on, and a witness may be missing
         self.sync()
@@ -283,6 +294,7 @@ class Journal:
         seal, records = _chained(self._seal._replace(first=self._seal.last, digest=start), self._live())
         content = seal.packed() + start + records
         with writing(self._path):
+            fcntl.flock(self._spare, fcntl.LOCK_EX | fcntl.LOCK_NB)
             _write(self._spare, content, 0)
             os.fsync(self._spare)
             self._spare_path.replace(self._path)

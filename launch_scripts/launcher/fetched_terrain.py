@@ -13,7 +13,6 @@ from launch_scripts.process_table import TABLE
 from shared_map.keeper.base_map import NEEDED, fetch_base_map
 from shared_map.terrain.row_bands import Progress, no_progress
 from shared_map.terrain.store import load_prepared, save_prepared, scenario_key
-from shared_map.terrain.terrain import terrain_digest
 from shared_map.terrain.true_ground import build_truth
 from swarm.bus.zenoh_bus import open_bus
 from swarm.config.plugin_names import cost_layers_of
@@ -82,12 +81,13 @@ def fetch_if_missing(
         lock = (run_dir / "terrain.lock").open("wb")
     with lock:
         fcntl.flock(lock, fcntl.LOCK_EX)  # one process of this machine at a time fetches
-        here = load_prepared(run_dir, key)
+        here = None
+        try:
+            here = load_prepared(run_dir, key)
+        except TerrainError as error:
+            log.warning("fetching the terrain again: %s", error)
         if here is not None and (here.photo.any() or not looks):
-            costs = scenario.cost
-            if here.digest == terrain_digest(here.grid, here.pace_s_per_m, costs, here.elevation_m):
-                return
-            log.warning("the terrain in %s is not as it was written: fetching it again", run_dir)
+            return
         log.info("%s: asking the keepers of run %s for the base map", why, found[0].run_id)
         layers = (*NEEDED, "photo") if looks else NEEDED
         with open_bus(scenario.network, authenticator=authenticator_of(scenario.network, found[0].run_id)) as bus:

@@ -35,30 +35,30 @@ def start_forkserver(loads: str | None) -> None:
     loads  `ROLES_ONLY` or `ROLES_AND_KERNELS`; None: nothing
     """
     # One thread each: the processes share the cores already, and idle threads make a fork unsafe.
-    os.environ.update(OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1", MKL_NUM_THREADS="1")
+    os.environ.update({LOADS: loads or ""}, OMP_NUM_THREADS="1", OPENBLAS_NUM_THREADS="1", MKL_NUM_THREADS="1")
     forkserver.set_forkserver_preload([] if loads is None else ["launch_scripts.launcher.preloaded"])
-    # The tracker's start unblocks signals, so it comes first.
-    resource_tracker.ensure_running()
-    # Signals blocked here stay blocked in the server and in all that it forks: a Ctrl-C, which reaches the whole
-    # process group, or a SIGTERM to all of it, is for the launcher alone to act upon.
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, _HELD_BACK)
-    os.environ[LOADS] = loads or ""
-    try:
+    with forking():
         forkserver.ensure_running()
-    finally:
-        del os.environ[LOADS]
-        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 @contextlib.contextmanager
-def without_main() -> Iterator[None]:
-    """Keeps multiprocessing from running the launcher's own script in each child."""
+def forking() -> Iterator[None]:
+    """The start of a process by the forkserver, which is started first where there is none: by `start_forkserver`,
+    or because it was killed.
+
+    Signals blocked here stay blocked in the server and in all that it forks: a Ctrl-C, which reaches the whole
+    process group, or a SIGTERM to all of it, is for the launcher alone to act upon. Also keeps multiprocessing from
+    running the launcher's own script in each child.
+    """
+    resource_tracker.ensure_running()  # its start unblocks signals, so it comes first
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, _HELD_BACK)
     main = sys.modules["__main__"]
     sys.modules["__main__"] = types.ModuleType("__main__")
     try:
         yield
     finally:
         sys.modules["__main__"] = main
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 class WarmUp:
@@ -139,7 +139,7 @@ class WarmUp:
     def _builder(self, *, tells: bool) -> Connection:
         """Starts a builder. Returns the pipe on which it tells what it has compiled."""
         listens, tell = self._context.Pipe(duplex=False)
-        with self._lock, without_main():
+        with self._lock, forking():
             if not self._closed:
                 builder = self._context.Process(target=_build, args=(tell, self._scenario, tells), daemon=True)
                 builder.start()

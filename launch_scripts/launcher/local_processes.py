@@ -17,7 +17,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from launch_scripts.launcher.child_main import ExitReason, run_child
-from launch_scripts.launcher.forkserver import without_main
+from launch_scripts.launcher.forkserver import forking
 from launch_scripts.launcher.hang_watch import LOOK_EVERY_S, STILL_S, IdleTime, Stillness, sight_of
 from launch_scripts.launcher.log_file import LogFormat
 from launch_scripts.process_table import STOP_ORDER, TABLE, ProcessSpec
@@ -327,7 +327,7 @@ class LocalSwarm:
         entry, log_path = spec.entry or TABLE[spec.role].entry, self._log_dir / f"{spec.name}.log"
         arguments = (entry, setup, log_path, self._log_format, running.health, tell)
         process = self._context.Process(target=run_child, args=arguments, name=spec.name, daemon=True)
-        with without_main():
+        with forking():
             process.start()
         tell.close()
         running.process, running.pipe, running.last_word = process, listen, None

@@ -199,7 +199,7 @@ def next_incarnation(run_dir: Path, role: str, id: str) -> int:
     """
     path = run_dir / "lives" / f"{role}-{id}"
     with writing(path):
-        path.parent.mkdir(exist_ok=True)
+        path.parent.mkdir(parents=True, exist_ok=True)
         file = os.open(path, os.O_CREAT | os.O_RDWR, 0o644)
         try:
             fcntl.flock(file, fcntl.LOCK_EX)  # of two that start at once each gets a number of its own

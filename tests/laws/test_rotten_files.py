@@ -16,10 +16,14 @@ from support.effort import few
 from support.map_strategies import set_of
 
 from shared_map.keeper.mark_store import KeeperStore
+from shared_map.terrain.store import load_homes, load_terrain, load_truth, prepare
+from shared_map.vehicle_class_grounds import class_grounds, load_classes, prepare_classes
+from swarm.config.load import parse_scenario
 from swarm.errors import SwarmError
 from swarm.grid import GridSpec
 from swarm.right_of_way.generations import GenerationFile
 from swarm.right_of_way.promise_store import FilePromiseStore
+from swarm.runtime.role_setup import RoleSetup
 from swarm.wire.messages.map_data import MarkKind
 from swarm.wire.messages.orders import Order
 from swarm.wire.messages.traffic import Held, Table
@@ -207,6 +211,53 @@ def test_a_commit_that_a_kill_cut_short_is_there_record_by_record_or_not(tmp_pat
             torn = whole[: chance.randrange(len(whole))]
         found = opened(kind, tmp_path, {**after, written: torn, "store.lock": before["store.lock"]})
         assert all(part in each for part, *each in zip(found, old, new, strict=True))
+
+
+PREPARED = parse_scenario("""
+seed = 5
+terrain = { source = "synthetic", rows = 24, cols = 32, relief_m = 200.0, hidden = { rubble_fields = 3 } }
+cost = { directional = true, vehicle_radius_m = 9.0 }
+groups = [{ vehicles = 1 }, { name = "walkers", class = "walker", vehicles = 1 }]
+[[classes]]
+name = "walker"
+max_speed_m_per_s = 1.5
+cost = { max_slope_deg = 40.0 }
+""")
+
+
+def read_prepared(folder: Path) -> list[object]:
+    """All that a process takes from the terrain in a run's folder."""
+    setup = RoleSetup(PREPARED, "run", "agent", "a0", 1, 1, run_dir=folder)
+    terrain = load_terrain(setup)
+    truth = load_truth(setup, terrain)
+    load_classes(setup, terrain)
+    grounds = class_grounds(PREPARED, terrain, truth, load_homes(setup, terrain, truth)).values()
+    ours = [each.terrain for each in grounds]
+    parts = [(each.digest, each.grid, each.notes, each.climb and each.climb.steepest) for each in ours]
+    arrays = [array for each in grounds for array in (each.truth, each.homes)]
+    arrays += [array for each in ours for array in (each.pace_s_per_m, each.ground_s_per_m, each.elevation_m)]
+    arrays += [array for each in ours for array in (each.photo, each.classes)]
+    arrays += [each.climb.factors for each in ours if each.climb]
+    return [*parts, *(array.tobytes() for array in arrays)]
+
+
+def test_no_change_of_a_prepared_terrain_goes_unnoticed(tmp_path: Path) -> None:
+    whole, tried, chance = tmp_path / "whole", tmp_path / "tried", Random(7)
+    prepare_classes(whole, PREPARED, *prepare(whole, PREPARED))
+    truth, files = read_prepared(whole), sorted(each for each in whole.rglob("*") if each.is_file())
+    found: Counter[str] = Counter()
+    for _ in range(few(200)):
+        shutil.rmtree(tried, ignore_errors=True)
+        shutil.copytree(whole, tried)
+        file, what = chance.choice(files), chance.choice(("flip", "flip", "zeros", "cut", "swapped", "repeated"))
+        (tried / file.relative_to(whole)).write_bytes(rotten(chance, file.read_bytes(), what))
+        try:
+            outcome = "as it was" if read_prepared(tried) == truth else f"UNNOTICED {file}"
+        except SwarmError as error:
+            outcome = "refused" if str(tried) in str(error) else f"WITHOUT THE FILE: {error}"
+        found[f"{what}: {outcome}"] += 1
+    assert not [each for each in found if not each.endswith((": refused", ": as it was"))], found
+    assert {"flip: refused", "zeros: refused", "cut: refused"} <= found.keys()
 
 
 if __name__ == "__main__":

@@ -2,6 +2,7 @@
 
 import multiprocessing
 import os
+import signal
 import socket
 import sys
 import time
@@ -9,6 +10,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from unittest import mock
 
+import psutil
 import pytest
 from support.idle_swarm import idle_swarm
 from support.processes import eventually
@@ -236,6 +238,23 @@ def test_a_process_begins_once_what_it_waits_for_is_so_and_not_at_all_after_the_
     allowed.append("a1")
     assert swarm.poll() == []
     assert not other.alive
+
+
+def test_what_is_started_after_the_forkserver_was_killed_leaves_signals_to_the_launcher_as_before(
+    tmp_path: Path, swarms: list[LocalSwarm]
+) -> None:
+    swarm = started(swarms, tmp_path, ("agent", "a0", "quiet"))
+    running, order = swarm.running[0], tmp_path / "order.txt"
+
+    def held_back() -> str:
+        return next(line for line in Path(f"/proc/{running.pid}/status").open() if line.startswith("SigBlk"))
+
+    before = held_back()
+    assert int(before.split()[1], 16) >> signal.SIGINT - 1 & 1
+    os.kill(psutil.Process(running.pid).ppid(), signal.SIGKILL)
+    endings_within(swarm)
+    eventually(lambda: swarm.poll() or order.read_text().count("+agent-a0") == 2, 10, "the second start")
+    assert held_back() == before
 
 
 def test_an_added_process_that_refuses_ends_no_run(tmp_path: Path, swarms: list[LocalSwarm]) -> None:

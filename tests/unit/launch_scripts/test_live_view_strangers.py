@@ -126,6 +126,15 @@ def test_a_reader_that_takes_nothing_is_cut_off(sinks: Sinks, monkeypatch: pytes
         eventually(lambda: threading.active_count() <= before, 20, "the end of its thread")
 
 
+def test_connections_that_ask_for_nothing_of_the_stream_keep_no_visitor_out(sinks: Sinks) -> None:
+    with contextlib.ExitStack() as stack:
+        for _ in range(MOST_CONNECTIONS):
+            silent = stack.enter_context(socket.create_connection(("127.0.0.1", sinks.web_port), timeout=20))
+            silent.sendall(b"PRI * HTTP/2.0\r\n\r\nSM\r\n\r\n" + bytes([0, 0, 0, 4, 0, 0, 0, 0, 0]))
+            assert silent.recv(9), "rerun's server has greeted it"
+        assert ask(sinks.web_port, "GET", "/", {})[0] in (200, 302)
+
+
 def test_who_takes_the_stream_looks_and_who_only_knocks_does_not(sinks: Sinks) -> None:
     page = sinks.web_port
     eventually(lambda: sinks.audience().now == 0, 30, "those of the tests before are gone")

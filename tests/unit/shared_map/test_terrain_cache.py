@@ -81,7 +81,7 @@ def test_the_code_is_all_that_makes_terrain(tmp_path: Path) -> None:
     assert source_digest.__wrapped__(tmp_path) != before
 
 
-@pytest.mark.parametrize("name", ["pace.npy", "terrain.json", "sums.json"])
+@pytest.mark.parametrize("name", ["pace.npy", "homes.npy", "terrain.json"])
 @pytest.mark.parametrize("damage", ["a byte", "cut", "gone", "not ours"])
 def test_a_damaged_terrain_is_made_anew_and_that_is_said(tmp_path, cache, built, caplog, name, damage):
     first, _ = prepare(tmp_path / "one", SMALL)

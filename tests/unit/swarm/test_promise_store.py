@@ -2,6 +2,7 @@
 
 import errno
 import os
+import shutil
 import subprocess
 import sys
 import threading
@@ -40,6 +41,28 @@ def test_what_was_saved_is_there_again(tmp_path: Path) -> None:
     again = FilePromiseStore(tmp_path / "run" / "promises-a0")
     assert again.own == own
     assert again.saved == {0: (3, table(0, 2)), 4: (8, table(4, 1))}
+    again.close()
+
+
+@pytest.mark.parametrize("gone", ["nothing", "the folder", "its place", "promises-a0.lock", "promises-a0.spare"])
+def test_promises_go_on_and_stay_locked_whatever_is_moved_or_deleted(tmp_path: Path, gone: str) -> None:
+    path, chance = tmp_path / "run" / "promises-a0", Random(gone)
+    store = FilePromiseStore(path)
+    at = chance.randrange(2500)
+    for seq in range(12_000):  # the file is full twice
+        store.save(3, table(0, seq))
+        if seq == at and gone == "its place":
+            path.parent.rename(tmp_path / "moved")
+        elif seq == at and gone == "the folder":
+            shutil.rmtree(path.parent)
+        elif seq == at and gone != "nothing":
+            (path.parent / gone).unlink()
+    store.sync()
+    with pytest.raises(StoreError, match="is in use by the same agent"):
+        FilePromiseStore(path)
+    store.close()
+    again = FilePromiseStore(path)
+    assert (again.own, again.saved) == (store.own, {0: (3, table(0, 11_999))})
     again.close()
 
 
