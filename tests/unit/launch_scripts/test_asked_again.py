@@ -78,4 +78,3 @@ def test_a_process_that_never_answers_is_named_and_one_that_no_run_needs_is_aske
         ask(run_info(GRID, crew=["places-all"]), 1_000)
     with pytest.raises(BusError, match=r"no process (plans routes to places here|answers)"):
         ask(run_info(GRID, crew=["keeper-k"]), 1_000)
-
