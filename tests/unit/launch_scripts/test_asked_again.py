@@ -74,8 +74,7 @@ def test_while_another_takes_over_a_route_to_a_place_is_asked_for_again(ask: Any
 
 
 def test_a_process_that_never_answers_is_named_and_one_that_no_run_needs_is_asked_once(ask: Any) -> None:
-    with pytest.raises(BusError, match="places-all does not answer|no process answers"):
+    with pytest.raises(BusError, match=r"places-all does not answer|no process answers"):
         ask(run_info(GRID, crew=["places-all"]), 1_000)
     with pytest.raises(BusError, match=r"no process (plans routes to places here|answers)"):
         ask(run_info(GRID, crew=["keeper-k"]), 1_000)
-
