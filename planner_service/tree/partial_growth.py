@@ -186,7 +186,7 @@ class PartialGrowth:
 
     def learn(self, changes: Changes) -> None:
         """The map has changed: the tree in hand is that of the map as it was, and cannot go on."""
-        if self.cost.size:
+        if self.cost.size and changes.cells.size:
             self.cost[changes.cells] = np.where(changes.after < np.inf, np.float32(np.inf), WALL)
 
     def _clear(self) -> None:

@@ -59,7 +59,7 @@ def test_a_target_over_water_has_the_nearest_shore_from_which_a_tree_led(
             # It steps over water, jumps anywhere, and now and then the map changes where it stands.
             row, col = grid.row_col(cell)
             row, col = row + int(rng.integers(-2, 3)), col + int(rng.integers(-2, 3))
-            if rng.random() < 0.1 or not grid.inside(row, col):
+            if rng.random() < 0.4 or not grid.inside(row, col):
                 row, col = int(rng.integers(grid.rows)), int(rng.integers(grid.cols))
             cell = grid.cell(row, col)
             if rng.random() < 0.15:
