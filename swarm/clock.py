@@ -5,6 +5,8 @@ from __future__ import annotations
 import time
 from typing import Protocol
 
+from swarm.errors import ConfigError
+
 NS_PER_S = 1_000_000_000
 _APART_NS, _TRIES = 100_000, 1000
 """Two readings that are further apart are taken again: the process was stopped between them."""
@@ -18,17 +20,33 @@ class Clock(Protocol):
         ...
 
 
+_LIMIT_NS = 1 << 62
+"""Of all times in messages, in the year 2116."""
+_NS_PER_YEAR = 31_556_952 * NS_PER_S
+
+
+def date_ns() -> int:
+    """Nanoseconds since 1970 by the machine's clock. Raises ConfigError on a time that no message can carry."""
+    found_ns = time.time_ns()
+    if not 0 <= found_ns < _LIMIT_NS:
+        raise ConfigError(
+            f"this machine's clock is in the year {1970 + found_ns // _NS_PER_YEAR}, expected 1970 to 2116: set it"
+        )
+    return found_ns
+
+
 class MonotonicClock:
     """The machine's time at the start of the process, continued by its monotonic counter.
 
     Two readings in one process may be subtracted. Readings of two machines differ as their clocks did at the start.
     The offset is wrong by at most `_APART_NS`, even if the process is stopped while it reads the two counters.
+    Raises as `date_ns`.
     """
 
     def __init__(self) -> None:
         for _ in range(_TRIES):
-            before_ns, date_ns, after_ns = time.monotonic_ns(), time.time_ns(), time.monotonic_ns()
-            self._offset_ns = date_ns - after_ns
+            before_ns, now_ns, after_ns = time.monotonic_ns(), date_ns(), time.monotonic_ns()
+            self._offset_ns = now_ns - after_ns
             if after_ns - before_ns <= _APART_NS:
                 break
 

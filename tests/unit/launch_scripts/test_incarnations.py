@@ -7,7 +7,8 @@ import pytest
 
 from launch_scripts.launcher import run_options
 from launch_scripts.launcher.run_options import next_incarnation
-from swarm.errors import StoreError
+from swarm.clock import MonotonicClock
+from swarm.errors import ConfigError, StoreError
 
 
 def test_every_start_is_a_later_generation_though_the_clock_goes_back_forward_and_to_1970(
@@ -15,11 +16,24 @@ def test_every_start_is_a_later_generation_though_the_clock_goes_back_forward_an
 ) -> None:
     hour_ns, now_ns = 3600 * 10**9, 1_800_000_000 * 10**9
     found = []
-    for clock_ns in (now_ns, now_ns - hour_ns, 0, now_ns + hour_ns, now_ns):
+    for clock_ns in (now_ns, now_ns - hour_ns, 0, now_ns + hour_ns, now_ns, 2 * now_ns, now_ns, 0, now_ns):
         monkeypatch.setattr(run_options.time, "time_ns", lambda clock_ns=clock_ns: clock_ns)
         found.append(next_incarnation(tmp_path, "agent", "a0"))
     assert found == sorted(set(found))
     assert next_incarnation(tmp_path, "agent", "a1") == now_ns, "each process has lives of its own"
+
+
+@pytest.mark.parametrize(("clock_ns", "year"), [(-1, 1969), (1 << 62, 2116), (7_283_273_229_637_594_984, 2200)])
+def test_a_clock_whose_time_no_message_can_carry_is_one_sentence(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, clock_ns: int, year: int
+) -> None:
+    began = next_incarnation(tmp_path, "agent", "a0")
+    with monkeypatch.context() as patched:
+        patched.setattr(run_options.time, "time_ns", lambda: clock_ns)
+        for start in (MonotonicClock, lambda: next_incarnation(tmp_path, "agent", "a0")):
+            with pytest.raises(ConfigError, match=f"clock is in the year {year}, expected 1970 to 2116: set it"):
+                start()
+    assert next_incarnation(tmp_path, "agent", "a0") > began
 
 
 def test_of_many_that_start_at_once_each_gets_a_number_of_its_own(tmp_path: Path) -> None:
