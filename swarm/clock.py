@@ -21,17 +21,15 @@ class Clock(Protocol):
 
 
 _LIMIT_NS = 1 << 62
-"""Of all times in messages, in the year 2116."""
-_NS_PER_YEAR = 31_556_952 * NS_PER_S
+"""No time in a message reaches it: it is in the year 2116."""
 
 
 def date_ns() -> int:
     """Nanoseconds since 1970 by the machine's clock. Raises ConfigError on a time that no message can carry."""
     found_ns = time.time_ns()
     if not 0 <= found_ns < _LIMIT_NS:
-        raise ConfigError(
-            f"this machine's clock is in the year {1970 + found_ns // _NS_PER_YEAR}, expected 1970 to 2116: set it"
-        )
+        year = time.gmtime(found_ns // NS_PER_S).tm_year
+        raise ConfigError(f"this machine's clock is in the year {year}, expected 1970 to 2116: set it")
     return found_ns
 
 

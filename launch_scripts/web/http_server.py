@@ -33,7 +33,7 @@ _AUTHORITY = r"(?:([A-Za-z0-9.]+)|\[([0-9A-Fa-f:.]+)\])(?::[0-9]{1,5})?"
 _SAYS_HOST = {"host": re.compile(_AUTHORITY), "origin": re.compile(f"https?://{_AUTHORITY}")}
 """A name or address and a port, and nothing else: parsers of URLs disagree about all other forms."""
 _GREETING_BYTES = 100
-"""What rerun's server says at once to a connection that asks for nothing has fewer."""
+"""More than rerun's server says to a connection that asks for nothing."""
 _HTTP_2 = b"PRI * HTTP/2.0\r\n"
 """The first line of HTTP/2 in the clear, which native viewers speak and no browser does."""
 _HEADERS = {
