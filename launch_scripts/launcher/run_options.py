@@ -194,7 +194,7 @@ def make_run_dir(runs: Path, run_id: str) -> Path:
 
 def next_incarnation(run_dir: Path, role: str, id: str) -> int:
     """The incarnation of a process that starts now: nanoseconds since 1970, and in any case higher than that of
-    every earlier start in this run's folder. Raises StoreError if the folder cannot be written, and as `date_ns`.
+    every earlier start in this run's folder. Raises StoreError if the folder cannot be written.
 
     A restart is therefore the later one even if the clock was set back meanwhile.
     """
