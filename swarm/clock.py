@@ -18,6 +18,15 @@ class Clock(Protocol):
         ...
 
 
+_LATEST_NS = 4_000_000_000 * NS_PER_S
+"""A clock beyond the year 2096 is wrong. Times in messages stay below 2^62, which is 19 years later."""
+
+
+def date_ns() -> int:
+    """Nanoseconds since 1970 by the machine's clock, in any case a time that a message can carry."""
+    return min(max(time.time_ns(), 0), _LATEST_NS)
+
+
 class MonotonicClock:
     """The machine's time at the start of the process, continued by its monotonic counter.
 
@@ -27,8 +36,8 @@ class MonotonicClock:
 
     def __init__(self) -> None:
         for _ in range(_TRIES):
-            before_ns, date_ns, after_ns = time.monotonic_ns(), time.time_ns(), time.monotonic_ns()
-            self._offset_ns = date_ns - after_ns
+            before_ns, now_ns, after_ns = time.monotonic_ns(), date_ns(), time.monotonic_ns()
+            self._offset_ns = now_ns - after_ns
             if after_ns - before_ns <= _APART_NS:
                 break
 

@@ -20,6 +20,7 @@ from launch_scripts.observe.run_folder import LAST
 from launch_scripts.ports import free_ports
 from launch_scripts.web import LOOPBACK
 from shared_map.importers.terrain_sources import FILE_KINDS, is_terrain
+from swarm.clock import date_ns
 from swarm.config.cost_rules import cost_of_preset
 from swarm.config.explain import choice, converted, nearest
 from swarm.config.ground import TerrainConfig
@@ -161,7 +162,7 @@ def new_run_id() -> str:
     return f"{time.strftime('%Y%m%d-%H%M%S')}-{secrets.token_hex(2)}"
 
 
-_HIGHEST = 1 << 61
+_HIGHEST = (1 << 62) - 2
 _DIGITS = 20
 """Width of the number in a file of incarnations, which never changes."""
 
@@ -208,7 +209,7 @@ def next_incarnation(run_dir: Path, role: str, id: str) -> int:
             # Without a digest it is from before there were any. A changed file is made again from the clock.
             if len(digits) == _DIGITS and digits.isdigit() and digest in (b"", _hex_digest(digits)):
                 last = min(int(digits), _HIGHEST)
-            incarnation = max(time.time_ns(), last + 1)
+            incarnation = max(date_ns(), last + 1)
             # Fixed-length write in place, so that a restart works on a full disk.
             digits = b"%0*d" % (_DIGITS, incarnation)
             content = digits + b" " + _hex_digest(digits)

@@ -32,8 +32,8 @@ SEND_WITHIN_S = 20.0
 _AUTHORITY = r"(?:([A-Za-z0-9.]+)|\[([0-9A-Fa-f:.]+)\])(?::[0-9]{1,5})?"
 _SAYS_HOST = {"host": re.compile(_AUTHORITY), "origin": re.compile(f"https?://{_AUTHORITY}")}
 """A name or address and a port, and nothing else: parsers of URLs disagree about all other forms."""
-_GREETING_BYTES = 256
-"""What rerun's server says to a connection that asks for nothing has fewer."""
+_GREETING_BYTES = 100
+"""More than rerun's server says to a connection that asks for nothing."""
 _HTTP_2 = b"PRI * HTTP/2.0\r\n"
 """The first line of HTTP/2 in the clear, which native viewers speak and no browser does."""
 _HEADERS = {
@@ -163,9 +163,9 @@ class Server(socketserver.ThreadingTCPServer):
                 _cut(connection)
 
     def keep(self, connection: socket.socket) -> None:
-        """Keeps a connection open."""
+        """Keeps a connection open, from the first call on."""
         with self._lock:
-            if connection in self._open:
+            if connection in self._open and self._open[connection].until_s != math.inf:
                 self._open[connection].until_s = math.inf
                 self._kept += 1
 
@@ -283,7 +283,6 @@ class _Visit(BaseHTTPRequestHandler):
         self.close_connection = True
         self.connection.settimeout(0.0)
         head += cast("io.BufferedReader", self.rfile).peek()  # bytes read beyond the head
-        taken = 0
         with socket.create_connection(behind, timeout=SEND_WITHIN_S) as inner:
             self.connection.settimeout(SEND_WITHIN_S)
             inner.sendall(head)
@@ -293,11 +292,9 @@ class _Visit(BaseHTTPRequestHandler):
                     piece = source.recv(1 << 16)
                     if not piece:
                         return
+                    if source is inner and len(piece) > _GREETING_BYTES:
+                        self.server.keep(self.connection)
                     ends[source].sendall(piece)
-                    if source is inner and taken < _GREETING_BYTES:
-                        taken += len(piece)
-                        if taken >= _GREETING_BYTES:
-                            self.server.keep(self.connection)
 
     def log_message(self, format: str, *args: Any) -> None:
         """Nothing is logged here, as a log may be what hangs."""

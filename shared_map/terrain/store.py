@@ -248,10 +248,8 @@ def read_array(folder: Path, name: str, meta: Description, shape: Iterable[int],
         array = open_array(path)
     except (OSError, ValueError, EOFError, SyntaxError, RecursionError, MemoryError) as error:
         raise TerrainError(f"prepared terrain {path} is unreadable ({error}); delete the folder") from error
-    if array.shape != tuple(shape) or array.dtype != dtype:
-        raise TerrainError(f"prepared terrain {path} is {array.shape} {array.dtype}, not as described; delete it")
-    if _sum(array) != meta.arrays.get(name):
-        raise TerrainError(f"prepared terrain {path} is damaged: its values have another sum; delete the folder")
+    if array.shape != tuple(shape) or array.dtype != dtype or _sum(array) != meta.arrays.get(name):
+        raise TerrainError(f"prepared terrain {path} is damaged: expected the values of {_META}; delete the folder")
     return array
 
 

@@ -3,11 +3,14 @@
 import threading
 from pathlib import Path
 
+import msgspec
 import pytest
 
 from launch_scripts.launcher import run_options
 from launch_scripts.launcher.run_options import next_incarnation
+from swarm.clock import MonotonicClock
 from swarm.errors import StoreError
+from swarm.wire.fields import StampNs
 
 
 def test_every_start_is_a_later_generation_though_the_clock_goes_back_forward_and_to_1970(
@@ -15,11 +18,22 @@ def test_every_start_is_a_later_generation_though_the_clock_goes_back_forward_an
 ) -> None:
     hour_ns, now_ns = 3600 * 10**9, 1_800_000_000 * 10**9
     found = []
-    for clock_ns in (now_ns, now_ns - hour_ns, 0, now_ns + hour_ns, now_ns):
+    for clock_ns in (now_ns, now_ns - hour_ns, 0, now_ns + hour_ns, now_ns, 2 * now_ns, now_ns, 0, now_ns):
         monkeypatch.setattr(run_options.time, "time_ns", lambda clock_ns=clock_ns: clock_ns)
         found.append(next_incarnation(tmp_path, "agent", "a0"))
     assert found == sorted(set(found))
     assert next_incarnation(tmp_path, "agent", "a1") == now_ns, "each process has lives of its own"
+
+
+@pytest.mark.parametrize("clock_ns", [-1, -(1 << 62), 1 << 62, 7_283_273_229_637_594_984, (1 << 63) - 1])
+def test_a_start_with_an_impossible_clock_is_one_of_which_messages_can_speak(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, clock_ns: int
+) -> None:
+    monkeypatch.setattr(run_options.time, "time_ns", lambda: clock_ns)
+    found = [next_incarnation(tmp_path, "agent", "a0") for _ in range(3)]
+    assert found == sorted(set(found))
+    for told_ns in (*found, MonotonicClock().now_ns()):
+        msgspec.convert(told_ns, StampNs)
 
 
 def test_of_many_that_start_at_once_each_gets_a_number_of_its_own(tmp_path: Path) -> None:

@@ -148,7 +148,7 @@ def test_who_takes_the_stream_looks_and_who_only_knocks_does_not(sinks: Sinks) -
             viewer = stack.enter_context(socket.create_connection(("127.0.0.1", page), timeout=5))
             viewer.sendall(head.encode() + b"Content-Length: 5\r\n\r\n" + bytes(5))
             assert viewer.recv(4) == b"HTTP"
-        assert sinks.audience() == Audience(now=2, ever=before.ever + 2)
+        eventually(lambda: sinks.audience() == Audience(now=2, ever=before.ever + 2), 10, "both have taken it")
     eventually(lambda: sinks.audience().now == 0, 30, "both are gone")
     assert sinks.audience() == Audience(now=0, ever=before.ever + 2)
 
