@@ -10,6 +10,7 @@ import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -24,6 +25,7 @@ from rasterio.warp import transform as to_crs
 from shared_map.array_files import Floats
 from shared_map.importers.raster_files import READ_ROWS
 from shared_map.terrain.row_bands import Progress, bands, no_progress
+from swarm.config.input_files import FileKind, read_text
 from swarm.errors import TerrainError
 from swarm.grid import MAX_CELLS, GridSpec
 
@@ -70,6 +72,17 @@ def system_named(text: str, what: str) -> Any:
             return rasterio.CRS.from_user_input(METRES if text == "local" else text)
     except (CRSError, ValueError) as error:
         raise TerrainError(f"{what} {text!r} is no coordinate system; write EPSG:32632 or alike") from error
+
+
+def own_system(dataset: Any, what: str, path: Path | None = None) -> Any:
+    """The coordinate system of a raster, or of the .prj beside it, which GDAL reads beside some formats only.
+
+    path  of the file, unless GDAL calls it the same
+    """
+    beside = (path or Path(dataset.name)).with_suffix(".prj")
+    if dataset.crs or not beside.is_file():
+        return dataset.crs
+    return system_named(read_text(beside, FileKind.SYSTEM), f"{what}: {beside}")
 
 
 def crs_of(found: Any, given: str | None, what: str, key: str = "terrain.crs") -> Any:
@@ -392,13 +405,19 @@ class Placed:
 def place_on(dataset: Any, grid: GridSpec, given: str | None, what: str, key: str = "terrain.crs") -> Placed:
     """Returns the transformation of a file onto the terrain's grid.
 
-    given  its system, as the value of `key` in the scenario; "local" is that of a terrain without a place
+    given  its system, as the value of `key` in the scenario; "local" is that of a terrain without a place. That of
+           the terrain counts for files which do not state theirs
 
     Raises TerrainError if one of the two has no place on Earth and they differ in size, the file does not say in
-    which system it is (nor does `given`), or does not overlap the terrain.
+    which system it is (nor does `given`), or does not overlap the terrain. Also on a picture without a place whose
+    camera was turned: its pixels lie otherwise than it is shown.
     """
     same_shape = (dataset.height, dataset.width) == grid.shape
-    has_place = bool(dataset.crs) or not dataset.transform.is_identity
+    has_place, own = not dataset.transform.is_identity, own_system(dataset, what)
+    turned = dataset.tags().get("EXIF_Orientation", "1")
+    if not has_place and turned != "1":
+        raise TerrainError(f"{what} has EXIF orientation {turned}, expected 1: save it upright, or georeference it")
+    given = None if own and key == "terrain.crs" else given
     if not has_place or (grid.crs == "local" and given is None):
         if not same_shape:
             raise TerrainError(
@@ -407,7 +426,7 @@ def place_on(dataset: Any, grid: GridSpec, given: str | None, what: str, key: st
             )
         metres = rasterio.CRS.from_wkt(METRES)
         return Placed(dataset, grid, dataset.transform, metres, metres, is_cells=True)
-    target, crs = systems_of(grid, dataset.crs, given, what, key)
+    target, crs = systems_of(grid, own, given, what, key)
     if target is None:
         target = crs = rasterio.CRS.from_wkt(METRES)
     with reprojecting(what, crs, target):

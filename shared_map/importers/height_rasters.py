@@ -18,7 +18,7 @@ from rasterio.transform import Affine, from_origin
 
 from shared_map.importers.cover import land_cover
 from shared_map.importers.cover.land_cover import TABLES, some
-from shared_map.importers.georeference import METRES, Placed, check_metres, crs_of, overruled, plan_grid
+from shared_map.importers.georeference import METRES, Placed, check_metres, crs_of, overruled, own_system, plan_grid
 from shared_map.importers.raster_files import NOTES, Numbers, in_memory, middle_of, opened, sampled
 from shared_map.importers.terrain_sources import Source
 from shared_map.importers.water_and_voids import MOST_SAMPLED, looked_at, without
@@ -67,7 +67,8 @@ def holds_cover(dataset: Any, what: str, config: TerrainConfig) -> bool:
     """
     if dataset.count >= 3:
         found = f"{dataset.count} bands of {dataset.dtypes[0]}, expected one of elevation"
-        raise TerrainError(f"{what} has {found}: gdal_translate -b 1 takes it out; a photo goes into terrain.photo")
+        how = "a photo goes into terrain.photo; gdal_calc.py unpacks heights from colours"
+        raise TerrainError(f"{what} has {found}: {how}, gdal_translate -b 1 takes one band out")
     if config.elevation_encoding is not None:
         return False
     if config.cover is None and (config.cover_codes is not None or config.cover_classes):
@@ -120,23 +121,23 @@ def _place_of(dataset: Any, path: Path, config: TerrainConfig, is_cover: bool) -
     An image without a place lies anywhere, in metres, as numbers of our own reading do that have no system.
     """
     what = f"terrain {path}"
-    own = dataset.tags().get(NOTES)
+    own, system = dataset.tags().get(NOTES), own_system(dataset, what)
     notes = () if own is None else tuple(own.split("\n"))
-    has_place = bool(dataset.crs) or not dataset.transform.is_identity
-    if has_place and own is not None and not dataset.crs and config.crs is None:
-        check_metres(dataset.transform.a, dataset.transform.c, what)
-        notes = (*notes, "x and y are taken for metres of a system without a name; terrain.crs names it")
-        return rasterio.CRS.from_wkt(METRES), dataset.transform, notes
-    is_image = path.suffix.lower() == ".png"
-    if has_place or not (is_cover or own is not None or is_image or config.crs == "local"):
-        crs = crs_of(dataset.crs, config.crs, what)
+    if not dataset.transform.is_identity:
+        if own is not None and not system and config.crs is None:
+            check_metres(dataset.transform.a, dataset.transform.c, what)
+            notes = (*notes, "x and y are taken for metres of a system without a name; terrain.crs names it")
+            return rasterio.CRS.from_wkt(METRES), dataset.transform, notes
+        crs = crs_of(system, config.crs, what)
         if crs.is_projected:
             check_metres(dataset.transform.a, dataset.transform.c, what)
-        return crs, dataset.transform, (*notes, *overruled(dataset.crs, config.crs, dataset.transform))
-    is_grey = is_image and not is_cover and own is None
+        return crs, dataset.transform, (*notes, *overruled(system, config.crs, dataset.transform))
+    is_grey = dataset.driver in ("PNG", "BMP") and not is_cover
     if config.resolution_m is None or (is_grey and not config.height_scale):
         scale = " and terrain.height_scale (metres per grey level)" if is_grey else ""
         raise TerrainError(f"{what} does not say how large a cell is; set terrain.resolution_m (metres){scale}")
+    if system or config.crs not in (None, "local"):
+        notes = (*notes, "! the file has a system, but no place in it: x and y count from its north-west corner")
     anywhere = from_origin(0.0, 0.0, config.resolution_m, config.resolution_m)
     return rasterio.CRS.from_wkt(METRES), anywhere, notes
 
@@ -196,12 +197,13 @@ def _scale_of(dataset: Any, crs: Any, config: TerrainConfig) -> tuple[float, flo
     text = str(dataset.units[0] or "").lower()
     # [m], US_survey_foot and ft (US) without their brackets and signs.
     unit = " ".join("".join(sign if sign.isalnum() else " " for sign in text).split())
-    unit_m = UNITS_M.get(unit, 1.0)
+    unit_m = UNITS_M.get(unit, UNITS_M.get(unit.removesuffix("s"), 1.0))
+    if unit and not {unit, unit.removesuffix("s")} & {*UNITS_M} and config.height_scale is None:
+        found = f"heights in {text[:40]!r}, an unknown unit"
+        raise TerrainError(f"terrain {config.source} has {found}; set terrain.height_scale (metres in one of it)")
     if unit_m != 1.0:
         factor, offset = factor * unit_m, offset * unit_m
         notes.append(f"heights are in {unit}, put into metres")
-    elif unit and unit not in UNITS_M and config.height_scale is None:
-        notes.append(f"heights are in {unit[:40]!r}, which is unknown, and taken for metres: terrain.height_scale")
     elif not unit and config.height_scale is None and crs.is_projected and crs.linear_units_factor[1] != 1.0:
         name, metres = crs.linear_units_factor
         notes.append(

@@ -390,11 +390,11 @@ class _Axis(NamedTuple):
 
 def _axis(values: NDArray[np.float64], name: str, what: str) -> _Axis:
     """The even steps that the different values along an axis lie on. Raises TerrainError if they lie on none."""
-    span = float(values[-1] - values[0]) if len(values) else 0.0
+    if len(values) < 2:
+        raise TerrainError(f"{what}: its points have {len(values)} different {name}; a grid has at least two")
+    span = float(values[-1] - values[0])
     apart = values[np.concatenate(([True], np.diff(values) > _SAME * span))]
     gaps = np.diff(apart)
-    if span <= 0 or not len(gaps):
-        raise TerrainError(f"{what}: all points have the same {name}; a grid has at least two of each")
     # Printed coordinates are rounded: the step is the whole extent over the number of steps, not the smallest gap.
     step = float(np.median(gaps[gaps < 1.5 * gaps.min()]))
     at = np.concatenate(([0], np.cumsum(np.rint(gaps / step))))

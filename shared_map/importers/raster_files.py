@@ -30,7 +30,7 @@ from numpy.typing import NDArray
 
 from shared_map.array_files import Floats
 from shared_map.terrain.row_bands import bands
-from swarm.config.input_files import FileKind, check_bytes, check_file, read_text, size
+from swarm.config.input_files import FileKind, check_bytes, check_file, size
 from swarm.errors import TerrainError
 from swarm.grid import MAX_CELLS, GridSpec
 
@@ -42,8 +42,8 @@ _NAMELESS, _ZIPPED = (
     {ending: key for ending, key in DRIVERS_BY_ENDING.items() if _FORMATS[key].get(kind)}
     for kind in ("nameless", "zipped")
 )
-_HEADER_LINE = re.compile(rb"\s*$|\W*(?!nan\b)[a-z_]+\s*[:\s]\s*\S+\s*$", re.IGNORECASE)
-"""A line of a word and a value, in the header of a grid as text. Surfer's has lines of numbers."""
+_HEADER_WORD = re.compile(rb"\W*(?!(nan|inf|infinity)$)[a-z_]+", re.IGNORECASE)
+"""The first word of a line of the header of a grid as text; a value follows. Surfer's has lines of numbers."""
 _NUMBER = re.compile(rb"[-+]?((\d+\.?\d*|\.\d+)(e[-+]?\d+)?|inf|infinity|nan)", re.IGNORECASE)
 _SURFER_LINES = 5
 _VOIDS, _COUNTS = {"nodata_value", "nodata", "null"}, {"ncols", "nrows", "cols", "rows", "line 2"}
@@ -68,7 +68,9 @@ READ_ROWS = 512
 """Rows that are read at once."""
 _HGT_BYTES = 2 * 1201 * 1201, 2 * 3601 * 3601
 _MOST_TIMES, _DEEPEST = 32, 4
-_LOSSY, _RAW = ("JPEG", "WEBP"), ("EHdr", "ENVI")
+_LOSSY, _RAW = ("JPEG", "WEBP", "LOSSY"), ("EHdr", "ENVI")
+_MOST_LOSS = 0.5
+"""Largest error of LERC that is exact: rounded, whole numbers are as they were."""
 _MAX_PIXELS = 16 * MAX_CELLS
 """Limit for formats which are read a part at a time. Of others, `MAX_CELLS`."""
 _MAX_BLOCK_BYTES = 512 << 20
@@ -93,10 +95,19 @@ class Numbers(NamedTuple):
     notes: tuple[str, ...] = ("numbers which are read without GDAL",)
 
 
+def is_named(path: Path, endings: Sequence[str]) -> bool:
+    """Returns True if a file's ending says how it is read, and its beginning does not contradict."""
+    if path.suffix.lower() not in endings or not path.is_file():
+        return path.suffix.lower() in endings
+    with path.open("rb") as file:
+        head = file.read(_HEAD_BYTES)
+    return not (head.startswith(tuple(_DRIVERS)) or other_format(head))
+
+
 def is_raster(path: Path) -> bool:
     """Returns True if a file begins or is named as a raster that is read."""
     with contextlib.suppress(OSError, TerrainError):
-        if path.suffix.lower() in PLAIN:
+        if is_named(path, PLAIN):
             return path.is_file()
         head, member, _ = beginning(path, tuple(_ZIPPED), FileKind.IMAGE, "")
         return bool(_driver(head, Path(member or path), ""))
@@ -129,9 +140,9 @@ def opened(path: Path, what: str, *, exact: bool = True) -> Iterator[Any]:
                 dataset = _georeferenced(path, what, files)
                 _check_numbers(dataset, f"{what} {path}")
                 packed = dataset.tags(ns="IMAGE_STRUCTURE")
-                if exact and (
-                    dataset.driver in _LOSSY or packed.get("COMPRESSION", "").rpartition(" ")[2] in _LOSSY
-                ):
+                how = packed.get("COMPRESSION", "").rpartition(" ")[2], packed.get("COMPRESSION_REVERSIBILITY")
+                loses = not {dataset.driver, *how}.isdisjoint(_LOSSY)
+                if exact and (loses or float(packed.get("MAX_Z_ERROR", 0)) > _MOST_LOSS):
                     raise TerrainError(f"{what} {path} is compressed with loss, expected exact numbers")
                 yield dataset
     except (RasterioError, CPLE_BaseError, UnicodeError) as error:  # the last of names, also inside the file
@@ -146,13 +157,13 @@ def _georeferenced(path: Path, what: str, files: contextlib.ExitStack) -> Any:
     import rasterio
     from rasterio.vrt import WarpedVRT
 
-    from shared_map.importers.georeference import system_named
+    from shared_map.importers.georeference import own_system
 
     what = f"{what} {path}"
-    if (suffix := path.suffix.lower()) in PLAIN:
+    if is_named(path, PLAIN):
         from shared_map.importers.plain_grids import read_npz, read_text_grid
 
-        return in_memory((read_npz if suffix == ".npz" else read_text_grid)(path, what), files)
+        return in_memory((read_npz if path.suffix.lower() == ".npz" else read_text_grid)(path, what), files)
     name, driver, length = _kind_of(path, what)
     dataset = files.enter_context(rasterio.open(name, driver=driver))
     _check_size(dataset, what)
@@ -160,14 +171,12 @@ def _georeferenced(path: Path, what: str, files: contextlib.ExitStack) -> Any:
     if driver in _RAW and length != stated:  # GDAL reads what is missing as 0
         raise TerrainError(f"{what} has {length} bytes, expected {stated}, as the header beside it says")
     if "text" in _FORMATS[driver]:
-        if not dataset.transform.a > 0 > dataset.transform.e:  # GDAL would mirror the ground
-            cell = f"{dataset.transform.a:g} x {-dataset.transform.e:g}"
+        numbers, place = _text_numbers(dataset, path, what), dataset.transform
+        if not place.a > 0 > place.e:  # GDAL would mirror the ground
+            cell = f"{place.a:g} x {-place.e:g}"
             raise TerrainError(f"{what}: its header gives a cell {cell}, expected a size above 0")
-        crs, beside = dataset.crs, path.with_suffix(".prj")
-        if not crs and beside.is_file():  # which GDAL reads beside some formats only
-            crs = system_named(read_text(beside, FileKind.SYSTEM), f"{what}: {beside}")
-        text = Numbers(_text_numbers(dataset, path, what), dataset.transform, crs, (f"a grid as text, {driver}",))
-        return in_memory(text, files)
+        notes = (f"a grid as text, {driver}",)
+        return in_memory(Numbers(numbers, place, own_system(dataset, what, path), notes), files)
     if dataset.transform.is_identity and dataset.gcps[0]:
         return files.enter_context(WarpedVRT(dataset))
     return dataset
@@ -178,6 +187,13 @@ def _check_numbers(dataset: Any, what: str) -> None:
     placed = dataset.transform
     if placed.determinant == 0 or not np.isfinite(list(placed)[:6]).all():
         raise TerrainError(f"{what} has pixels without a size; its georeference is damaged")
+    alphas = {each for each, kind in zip(dataset.dtypes, dataset.colorinterp, strict=True) if kind.name == "alpha"}
+    masks = {each.name for each in dataset.mask_flag_enums[0]} & {"per_dataset"} | alphas
+    if dataset.nodata is not None and masks:  # of which GDAL reads one or the other
+        found = f"a no-data value ({dataset.nodata:g}) and a mask or alpha band, expected one of them"
+        raise TerrainError(f"{what} has {found}: gdal_edit.py -unsetnodata drops the value")
+    if alphas - {"uint8", "uint16"}:  # which GDAL reads as a mask sometimes
+        raise TerrainError(f"{what} has an alpha band of {min(alphas)}, expected bytes: gdal_translate -mask helps")
     if 0 in dataset.scales or not np.isfinite([*dataset.scales, *dataset.offsets]).all():
         found = f"scales {dataset.scales[:4]} and offsets {dataset.offsets[:4]}"
         raise TerrainError(f"{what} has {found}, expected finite numbers, and no scale of 0")
@@ -241,8 +257,8 @@ def _skip_header(file: BinaryIO, dataset: Any, what: str) -> tuple[int, bytes | 
     void = b"*" if driver == "GRASSASCIIGrid" else None
     while line := file.readline(_HEADER_LINE_BYTES):
         key, *values = line.replace(b":", b" ", 1).split() or [b""]
-        is_header = number <= _SURFER_LINES if driver == "GSAG" else _HEADER_LINE.match(line)
-        if not is_header:
+        is_word = len(values) == 1 and key != void and _HEADER_WORD.fullmatch(key)
+        if not (number <= _SURFER_LINES if driver == "GSAG" else is_word or not key):
             file.seek(-len(line), 1)
             break
         name = f"line {number}" if driver == "GSAG" else key.decode("ascii", "replace").lower()
@@ -259,7 +275,7 @@ def _skip_header(file: BinaryIO, dataset: Any, what: str) -> tuple[int, bytes | 
             shown, kind = word[:40].decode("ascii", "replace"), "a whole number" if is_count else "a number"
             raise TerrainError(f"{what}: its header says {name} {shown!r}, expected {kind}")
     corner = [name for name in header if name.startswith(("xll", "yll"))]
-    if driver == "AAIGrid" and len({name[3:] for name in corner}) + (len(corner) != 2) != 1:
+    if driver == "AAIGrid" and (len(corner), len({name[3:] for name in corner})) != (2, 1):
         raise TerrainError(f"{what}: its header needs xllcorner and yllcorner, or xllcenter and yllcenter")
     if number_of(header.get("multiplier", [b"1"])[0]) != 1:  # which GDAL does not read
         raise TerrainError(f"{what}: its header has a multiplier; write it as a .tif")

@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 
 from shared_map.array_files import Bools, Bytes, Floats
-from shared_map.importers.raster_files import DRIVERS_BY_ENDING, PLAIN, is_raster
+from shared_map.importers.raster_files import DRIVERS_BY_ENDING, PLAIN, is_named, is_raster
 from shared_map.terrain.pace_layers import TerrainClass
 from shared_map.terrain.row_bands import Progress, no_progress
 from swarm.config.ground import TerrainConfig
@@ -84,7 +84,7 @@ def load_source(config: TerrainConfig, seed: int, progress: Progress = no_progre
 
         path = Path(config.source)
         check_file(path, FileKind.TEXT_GRID)
-        source = _map(path, config) if path.suffix.lower() in _LEVEL else read_raster(path, config, progress)
+        source = _map(path, config) if is_named(path, _LEVEL) else read_raster(path, config, progress)
     source = without_voids(source, config)
     if config.photo is not None:
         from shared_map.importers.cover.photos import read_photo

@@ -159,7 +159,7 @@ _STILL_M = 0.02
 see, a gentle slope is no lake: its far end is at another height."""
 _COARSE_M = 0.25
 """In whole metres gentle ground is level, too."""
-_LEAST_CELLS_FINE, _LEAST_CELLS_COARSE = 16, 40
+_LEAST_CELLS_TOLD, _LEAST_CELLS_FINE, _LEAST_CELLS_COARSE = 5, 16, 40
 _MOST_LOWER = 0.25
 """Water has a shore, above it but for an outlet. Level ground beside much lower ground is the top of something, or
 a part of a rounded slope. The next step of a river that is levelled in steps does not count as lower ground."""
@@ -222,10 +222,11 @@ def level_ground(elevation_m: Floats) -> LevelGround:
     heights_m, row, col = surveyed(elevation_m)
     mask, patches, level = _at_one_scale(np.ascontiguousarray(heights_m))
     finer = elevation_m.size / heights_m.size
-    if finer > 1:
-        mask, level = mask[np.ix_(row, col)], level[np.ix_(row, col)]
+    mask, level = mask[np.ix_(row, col)], level[np.ix_(row, col)]
+    least = max(min(int(_TOLD_SHARE * elevation_m.size), _LEAST_CELLS_COARSE), _LEAST_CELLS_TOLD)
+    if finer > 1 or least < _LEAST_CELLS_COARSE:
         # No level patch of the file itself becomes ground in silence, even if the survey is estimated wrongly.
-        own = level_patches(elevation_m, _SAME_M, _LEAST_CELLS_COARSE)
+        own = level_patches(elevation_m, _SAME_M, least)
         missed = own.cells - np.bincount(own.labels[mask], minlength=own.cells.size)
         large = (own.cells > _TOLD_SHARE * elevation_m.size) & (2 * missed > own.cells)
         large[0] = False
@@ -411,9 +412,9 @@ def _step_m(elevation_m: Floats) -> float:
 HIGHEST_M = 20_000.0
 """Heights beyond this, up or down, are undeclared voids."""
 _SEARCH_CELLS = 64
-_CODES = (-32768.0, -32767.0, -99999.0, -9999.0, -9998.0, -999.0, -500.0, 9999.0, 32767.0, 65535.0)
+CODES = (-32768.0, -32767.0, -99999.0, -9999.0, -9998.0, -999.0, -500.0, 9999.0, 32767.0, 65535.0)
 """Values which programs write for an unknown height."""
-_GAPS_M = {**dict.fromkeys(_CODES, 100.0), 0.0: 30.0}
+_GAPS_M = {**dict.fromkeys(CODES, 100.0), 0.0: 30.0}
 _ALONE = 3.0
 """A code is no-data if no other height is nearer to it than its gap, and than this multiple of the widest gap
 between other heights: real ground never has an isolated height."""

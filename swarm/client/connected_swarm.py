@@ -70,7 +70,7 @@ class Orders:
         places  as commands have them: "46.81,9.84", "xy:X,Y" or "cell:ROW,COL"
         then    after the last: "hold" there, "chase" targets again, or "repeat" from the first
         """
-        order = checked(SendVehicle, {"vehicle": vehicle, "places": list(places), "then": then})
+        order = checked(SendVehicle, {"vehicle": vehicle, "places": places, "then": then})
         return self._operator.give(order)[1]
 
     def recall(self, vehicle: str) -> Acknowledged:
@@ -83,7 +83,8 @@ class Orders:
 
     def chase(self, group: str, targets: Sequence[str] | None) -> Acknowledged:
         """States which targets the vehicles of a group may chase; None: those of the scenario."""
-        return self._give(subject="group", name=group, targets=list(targets or ()), off=targets is None)
+        named = [] if targets is None else targets
+        return self._give(subject="group", name=group, targets=named, off=targets is None)
 
     def add_target(
         self, id: str, x_m: float, y_m: float, *, walk: str | None = None, speed_m_per_s: float | None = None
@@ -287,7 +288,7 @@ class Swarm:
 
         Raises ConfigError on a place outside the terrain, BusError where no process plans to places.
         """
-        until_s = time.monotonic() + timeout_s
+        until_s = time.monotonic() + self._session.number("timeout_s", timeout_s, 0, 1e9)
         served = any(name.startswith("places-") for name in self._session.run.crew)
         start, goal = self.frame.cell(*start_m), self.frame.cell(*goal_m)
         request = PlaceRouteRequest(to=goal, cells=[start], vehicle_class=vehicle_class)

@@ -169,6 +169,7 @@ class Session:
 
     def ask(self, topic: Topic, request: Message, timeout_s: float, **fields: str) -> Future[list[Any]]:
         """All answers to a question. Its failure is a BusError."""
+        timeout_s = self.number("timeout_s", timeout_s, 0, 1e9)
         self.check_open()
         waiting: Future[list[Any]] = Future()
         with self.lock:

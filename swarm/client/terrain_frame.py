@@ -72,18 +72,15 @@ class Frame:
 
     def written(self, cell: int) -> str:
         """A cell for people, in each form that `cell_named` reads. Raises as `centre_m` and `to_wgs84`."""
-        self.centre_m(cell)
-        return written(self, cell)
+        return written(self, checked_cells(self, (cell,))[0])
 
     def centre_m(self, cell: int) -> Point:
         """(x_m, y_m) of the middle of a cell. Raises ConfigError on one outside the terrain."""
-        if not 0 <= cell < self.grid.cells:
-            raise ConfigError(f"cell {cell} is outside the terrain of {self.grid.rows} x {self.grid.cols} cells")
-        return self.grid.centre_m(cell)
+        return self.grid.centre_m(checked_cells(self, (cell,))[0])
 
     def cells_within(self, x_m: float, y_m: float, radius_m: float) -> list[int]:
         """The cells whose middle is within a radius of a place inside the terrain, and the cell of the place."""
-        at, step = self.cell(x_m, y_m), self.grid.resolution_m
+        at, step, radius_m = self.cell(x_m, y_m), self.grid.resolution_m, number("radius_m", radius_m)
         if not 0 <= radius_m < math.inf:
             raise ConfigError(f"radius_m is {radius_m!r}, expected metres, 0 or more")
         window = self.grid.around(at, min(math.ceil(radius_m / step), max(self.grid.rows, self.grid.cols)))
@@ -97,13 +94,13 @@ class Frame:
     def from_wgs84(self, lat_deg: float, lon_deg: float) -> Point:
         """Returns (x_m, y_m) of a latitude and longitude in degrees. Raises ConfigError if they are out of range,
         if the terrain has no geographic reference, or if pyproj (extra `wgs84`) is not installed."""
-        if not (-90 <= lat_deg <= 90 and -360 <= lon_deg <= 360):
+        if not (-90 <= number("lat_deg", lat_deg) <= 90 and -360 <= number("lon_deg", lon_deg) <= 360):
             raise ConfigError(f"lat_deg {lat_deg!r}, lon_deg {lon_deg!r} is no place on Earth")
         return self._transforms[0](lon_deg, lat_deg)
 
     def to_wgs84(self, x_m: float, y_m: float) -> Point:
         """(lat_deg, lon_deg) of a place. Raises as `from_wgs84`."""
-        lon_deg, lat_deg = self._transforms[1](x_m, y_m)
+        lon_deg, lat_deg = self._transforms[1](number("x_m", x_m), number("y_m", y_m))
         return lat_deg, lon_deg
 
     @cached_property
@@ -139,17 +136,23 @@ def checked_cells(frame: Frame, cells: Iterable[int]) -> list[int]:
     once: dict[int, None] = {}
     for each in cells:
         try:
-            cell = operator.index(each)  # of NumPy's integers too
+            cell = operator.index(None if _is_truth(each) else each)  # type: ignore[arg-type]  # of NumPy's, too
         except TypeError:
             raise ConfigError(f"cell {reprlib.repr(each)} is no whole number") from None
-        frame.centre_m(cell)
+        if not 0 <= cell < frame.grid.cells:
+            raise ConfigError(f"cell {cell} is outside the terrain of {frame.grid.rows} x {frame.grid.cols} cells")
         once[cell] = None
     return list(once)
 
 
 def number(name: str, value: Any) -> float:
-    """Converts a program's number to a float. Raises ConfigError on anything else, such as text."""
-    if not isinstance(value, str):
+    """Converts a program's number to a float. Raises ConfigError on anything else, such as text or truth."""
+    if not isinstance(value, str | bytes) and not _is_truth(value):
         with contextlib.suppress(TypeError, ValueError, OverflowError):
             return float(value)
     raise ConfigError(f"{name} is {reprlib.repr(value)}, expected a number")
+
+
+def _is_truth(value: Any) -> bool:
+    """Returns True for True and False, also those of NumPy, which Python takes for 1 and 0."""
+    return type(value).__name__ in ("bool", "bool_")

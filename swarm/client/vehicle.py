@@ -233,19 +233,21 @@ class Vehicle(Reported):
         `right_of_way`.
         """
         way, here = self._has_way(), self.cell
-        path = [here, *(cells[1:] if cells and cells[0] == here else cells)]
+        wanted = [checked_cells(self._session.frame, (cell,))[0] for cell in cells]
+        path = [here, *(wanted[1:] if wanted[:1] == [here] else wanted)]
         try:
             way.want(path)
         except ValueError as error:
             raise self._session.refused(f"vehicle {self.id}: {error}") from error
         if len(path) > 1:
-            way.may_enter(path[1], timeout_s)
+            self.may_enter(path[1], timeout_s)
         return list(way.cells[1:])
 
     def may_enter(self, cell: int, timeout_s: float = 0.0) -> bool:
         """Returns True if the vehicle may drive into a cell now, after waiting up to a timeout. Raises ConfigError
         unless it was made with `right_of_way`."""
-        return self._has_way().may_enter(cell, timeout_s)
+        wait_s = self._session.number("timeout_s", timeout_s, 0, 1e9)
+        return self._has_way().may_enter(checked_cells(self._session.frame, (cell,))[0], wait_s)
 
     def _has_way(self) -> ExternalSession:
         if self._way is None:

@@ -70,7 +70,7 @@ def expected(hint: Any) -> str:
         return f"one of {', '.join(map(repr, args))}"
     if origin is tuple and args[-1] is not Ellipsis:
         return f"[{', '.join(expected(arg) for arg in args)}]"
-    if origin is tuple:
+    if origin in (tuple, list):
         return "a list"
     if origin is dict or is_section(hint):
         return "a table"

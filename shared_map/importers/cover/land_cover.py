@@ -245,7 +245,7 @@ def read_cover(path: Path, grid: GridSpec, config: TerrainConfig, progress: Prog
                 " and class in terrain.cover_codes"
             )
         table, known_by = found
-        placed = place_on(dataset, grid, None if dataset.crs else config.crs, what)
+        placed = place_on(dataset, grid, config.crs, what)
         notes, how = [], "mode" if placed.grows else "nearest"
         if not placed.is_cells:
             taken, size = {"mode": "most frequent"}.get(how, how), f"{dataset.height} x {dataset.width} pixels"

@@ -14,6 +14,7 @@ from rasterio.enums import ColorInterp
 from shared_map.array_files import Bools, Bytes, Floats
 from shared_map.importers.georeference import place_on
 from shared_map.importers.raster_files import middle_of, opened, sampled
+from shared_map.importers.water_and_voids import CODES
 from shared_map.terrain.row_bands import Progress, no_progress
 from swarm.errors import TerrainError
 from swarm.grid import GridSpec
@@ -72,11 +73,13 @@ def read_photo(path: Path, grid: GridSpec, given_crs: str | None, progress: Prog
     """
     what = f"photo {path}"
     with opened(path, "photo", exact=False) as dataset:
-        placed = place_on(dataset, grid, None if dataset.crs else given_crs, what)
+        placed = place_on(dataset, grid, given_crs, what)
         size = f"{dataset.height} x {dataset.width} pixels"
         notes = [str(path), f"photo: {size}, covers {placed.share:.1%} of the terrain"]
+        if dataset.transform.is_identity:
+            notes.append("the photo has no place of its own: its pixels are taken for the terrain's cells")
         indexes, palette = _colour_bands(dataset)
-        low, high = (0.0, 0.0) if palette is not None else _stretch(dataset, indexes, notes)
+        low, high = (0.0, 0.0) if palette is not None else _stretch(dataset, indexes, notes, what)
         if len(indexes) == 1 and palette is None:
             notes.append("the photo is grey: without colour, what covers the ground is a guess")
 
@@ -121,14 +124,20 @@ def _colour_bands(dataset: Any) -> tuple[list[int], NDArray[np.uint8] | None]:
     return ([1, 2, 3] if dataset.count >= 3 else [1]), None
 
 
-def _stretch(dataset: Any, indexes: list[int], notes: list[str]) -> tuple[float, float]:
-    """Darkest and brightest of a photo that is not in bytes; (0, 0) for bytes."""
+def _stretch(dataset: Any, indexes: list[int], notes: list[str], what: str) -> tuple[float, float]:
+    """Darkest and brightest of a photo that is not in bytes; (0, 0) for bytes. Raises TerrainError if it holds a
+    code for no data that it does not declare."""
     if all(dataset.dtypes[index - 1] == "uint8" for index in indexes):
         return 0.0, 0.0
     sample = sampled(dataset, tuple(indexes), _STRETCHED_CELLS).compressed().astype(np.float64)
     sample = sample[(np.abs(sample) <= np.finfo(np.float32).max) & (sample != 0)]
     if sample.size == 0:
         return 0.0, 1.0
+    if sample.min() in CODES and sample.min() < 0:
+        void = f"{sample.min():g}"
+        raise TerrainError(
+            f"{what} holds {void}, which is no brightness: gdal_edit.py -a_nodata {void} declares it"
+        )
     low, high = (float(value) for value in np.percentile(sample, (2, 98)))
     notes.append(f"photo stretched from {low:.4g}..{high:.4g} to bytes")
     return low, max(high, low + 1e-9)

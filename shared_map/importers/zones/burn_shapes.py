@@ -209,7 +209,7 @@ def _mended(
 ) -> tuple[NDArray[Any], NDArray[np.int64], set[str]]:
     """Shapes of features, and of which each is a part: polygons that cross themselves as what their rings enclose.
 
-    Raises TerrainError if a polygon encloses nothing, or takes too long to repair.
+    Raises TerrainError if a polygon encloses nothing, takes too long to repair, or has holes in holes.
     """
     shapes = features.shapes.copy()
     # A line of one place is a point: GEOS does not cut it.
@@ -220,6 +220,8 @@ def _mended(
     for n in wrong:
         if _crossings(shapes[n]) > _MOST_CROSSINGS:
             raise unusable(what, features.id(features.of[n]), "it crosses itself thousands of times")
+        if shapely.is_valid_reason(shapes[n]).startswith(("Holes are nested", "Nested holes")):
+            raise unusable(what, features.id(features.of[n]), "a hole of it lies in another")
         shapes[n] = shapely.make_valid(shapes[n], method="structure", keep_collapsed=False)
         if shapely.is_empty(shapes[n]):
             raise unusable(what, features.id(features.of[n]), "it encloses no ground")

@@ -389,6 +389,8 @@ _ONE_OF = {
     **dict.fromkeys(("Point", "LineString", "LinearRing"), ("coordinates",)),
 }
 """Elements of KML, and what each holds once."""
+_AREA_TAGS = {("natural", "water"), ("landuse", "reservoir"), ("landuse", "basin")}
+"""Tags of OpenStreetMap that only areas of water have."""
 
 
 def checked_xml(data: bytes, what: str) -> None:
@@ -400,6 +402,7 @@ def checked_xml(data: bytes, what: str) -> None:
         raise TerrainError(f"{what} names other files, which are not read")
     ends: dict[str | None, tuple[str | None, str | None]] = {}
     rings: dict[str | None, list[str | None]] = {}
+    open_areas: set[str | None] = set()
     known: set[tuple[str, str | None]] = set()
     needed: dict[tuple[str, str | None], str] = {}
     try:
@@ -433,6 +436,12 @@ def checked_xml(data: bytes, what: str) -> None:
                     raise TerrainError(f"{what} is damaged: way {element.get('id')} has one node; repair it")
                 if nodes:
                     ends[element.get("id")] = nodes[0], nodes[-1]
+                if (
+                    nodes
+                    and nodes[0] != nodes[-1]
+                    and any((tag.get("k"), tag.get("v")) in _AREA_TAGS for tag in element)
+                ):
+                    open_areas.add(element.get("id"))
             if name == "relation" and _is_area(element):
                 ways = [inner.get("ref") for inner in element if inner.get("type") == "way"]
                 rings[element.get("id")] = ways
@@ -446,6 +455,8 @@ def checked_xml(data: bytes, what: str) -> None:
                 element.clear()
     except ElementTree.ParseError as error:
         raise TerrainError(f"{what} is damaged: {error}") from error
+    for area in open_areas.difference(*rings.values()):  # GDAL makes lines of them
+        raise TerrainError(f"{what}: way {area} is an area, but its ring is not closed; repair it")
     for area, ways in rings.items():
         met = Counter(end for way in ways for end in ends.get(way, ()))
         if any(count % 2 for count in met.values()):  # GDAL leaves it out

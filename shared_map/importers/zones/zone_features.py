@@ -108,7 +108,7 @@ def way_of(kind: Kind | None, name: str, own: Mapping[str, WayConfig]) -> Way | 
 def states_extent(column: str) -> bool:
     """Returns True if a column states how far a point or a line reaches, in a unit that is read or not."""
     name = column.lower()
-    return name in _EXTENTS or "radius" in name or "diameter" in name
+    return name in _EXTENTS or any(word in name for word in ("radius", "diameter", "buffer"))
 
 
 def width_of(tags: Mapping[str, str]) -> float | None:

@@ -56,7 +56,7 @@ def load(path: Path, text: str | bytes | None = None, **settings: object) -> Sou
             "north: 46:30N\nsouth: 45:00N\neast: 9E\nwest: 8E\nrows: 2\ncols: 3\n1 2 3\n4 5 6",
             "north '46:30N', expected a number",
         ),
-        (b"\xff\xfe\x00", "is no raster that is read: it begins with .*gdal_translate"),
+        (b"\xfd\xfe\x00", "is no raster that is read: it begins with .*gdal_translate"),
         ("", "is no raster that is read: it begins with b''"),
     ],
 )

@@ -105,7 +105,7 @@ def test_empty_fields_and_nan_are_voids(tmp_path: Path) -> None:
         ("0,0,1\n10,0,2\n23,0,3\n0,10,3\n", "on no regular grid: x has gaps from 10 to 13"),
         ("0,0,1\n1,1,2\n1000,1000,3\n", "on no regular grid: 3 points are 0.0% of a grid of 1 x 1"),
         ("0,0,1\n1,1,2\n100000,100000,3\n", "3 points are 0.0% of a grid of 1 x 1; gdal_grid makes one"),
-        ("0,0,1\n0,1,2\n", "all points have the same x"),
+        ("0,0,1\n0,1,2\n", "its points have 1 different x; a grid has at least two"),
         ("0,0,1\nnan,1,2\n", "a point has no x or no y"),
         ("0,0,1\ninf,1,2\n", "a point has no x or no y"),
         ("0,0,1\n1e300,1,2\n", "a point has no x or no y, or one beyond"),

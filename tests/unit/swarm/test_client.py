@@ -110,6 +110,66 @@ def test_a_vehicle_that_cannot_be_is_refused_in_a_sentence(world: Swarm, wrong: 
     assert program.swarm.counts["refused"] == 1
 
 
+HALF, TRUTH, TEXT = 2.5, True, "7"
+
+
+@pytest.mark.parametrize("wrong", [HALF, TRUTH, np.bool_(True), TEXT, None, -1, GRID.cells, math.nan])
+def test_what_is_no_cell_is_refused_by_every_call_that_takes_one(world: Swarm, wrong: Any) -> None:
+    program = Program(world).swarm
+    rover = program.vehicle("rover")
+    rover.at(*program.frame.centre_m(GRID.cell(5, 5)))
+    rover.give_way(NeverAsked())  # type: ignore[arg-type]
+    for call in (
+        lambda: program.frame.centre_m(wrong),
+        lambda: program.frame.written(wrong),
+        lambda: rover.may_enter(wrong),
+        lambda: rover.reserve([wrong]),
+        lambda: rover.mark([wrong], lethal=True),
+    ):
+        with pytest.raises(ConfigError, match=r"^cell .*(no whole number|outside the terrain)"):
+            call()
+    assert program.frame.centre_m(np.int16(7)) == program.frame.centre_m(7)  # type: ignore[arg-type]
+
+
+class NeverAsked:
+    """Right of way which takes nothing, as nothing wrong reaches it."""
+
+    may_enter = want = None
+
+    def stands(self, cell: int) -> bool:
+        return True
+
+
+@pytest.mark.parametrize("wrong", [TRUTH, np.bool_(False), TEXT, b"7", None, [1.0, 2.0], math.nan])
+def test_what_is_no_number_is_refused_by_every_call_that_takes_one(world: Swarm, wrong: Any) -> None:
+    program = Program(world).swarm
+    frame, rover = program.frame, program.vehicle("rover")
+    x_m, y_m = frame.centre_m(GRID.cell(5, 5))
+    rover.at(x_m, y_m)
+    for call in (
+        lambda: frame.cell(wrong, y_m),
+        lambda: frame.cells_within(x_m, y_m, wrong),
+        lambda: frame.from_wgs84(wrong, 9.0),
+        lambda: rover.at(x_m, wrong),
+        lambda: rover.at(x_m, y_m, speed_m_per_s=wrong),
+        lambda: rover.route_soon("t", wrong),
+        lambda: program.route_soon("t", x_m, y_m, timeout_s=wrong),
+        lambda: program.route((x_m, y_m), (x_m, y_m), timeout_s=wrong),
+        lambda: program.observer(every_s=wrong),
+        lambda: program.target("new", lease_s=wrong),
+        lambda: rover.mark([7], pace_s_per_m=wrong) if wrong is not None else rover.mark([7]),
+    ):
+        with pytest.raises(ConfigError):
+            call()
+
+
+def test_one_text_is_no_list_of_texts(world: Swarm) -> None:
+    orders = Program(world).swarm.orders()
+    for call in (lambda: orders.send("v0", "cell:1,2"), lambda: orders.chase("all", "t0")):
+        with pytest.raises(ConfigError, match=r"the order is not possible: .*, expected a list"):
+            call()
+
+
 def test_one_program_has_each_vehicle_and_target_once_at_a_time(world: Swarm) -> None:
     program = Program(world)
     for make in (program.swarm.vehicle, program.swarm.target):

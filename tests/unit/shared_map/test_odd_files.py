@@ -1,0 +1,232 @@
+"""Files that other programs write in their own way: each is a true map, or refused by what it holds."""
+
+import re
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import rasterio
+import shapely
+from hypothesis import given
+from hypothesis import strategies as st
+from PIL import Image
+from rasterio.enums import ColorInterp
+from rasterio.shutil import copy
+from support.height_models import hills, load, written
+from support.zone_shapes import UTM, feature, geojson, painted
+
+from shared_map.importers.raster_files import _HEADER_WORD
+from shared_map.importers.water_and_voids import level_ground
+from swarm.config.ground import ZoneConfig
+from swarm.errors import TerrainError
+
+pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
+GROUND = hills(3, 200)
+PLACE = "20\n0\n0\n-20\n500010\n4999990\n"
+"""A world file: that of `written`."""
+SYSTEM = rasterio.CRS.from_epsg(32632).to_wkt()
+COLOURS = np.dstack([GROUND + 30, GROUND * 0.8 + 40, 240 - GROUND]).astype(np.uint8)
+HOLE = np.s_[40:60, 30:50]
+
+
+def opaque() -> np.ndarray:
+    """An alpha band: transparent in the hole."""
+    alpha = np.full(GROUND.shape, 255, np.uint8)
+    alpha[HOLE] = 0
+    return alpha
+
+
+def picture(path: Path, pixels: np.ndarray, **how: Any) -> Path:
+    Image.fromarray(pixels).save(path, **how)
+    for ending, text in ((f".{path.suffix[1]}{path.suffix[-1]}w", PLACE), (".prj", SYSTEM)):
+        path.with_suffix(ending).write_text(text)
+    return path
+
+
+@pytest.mark.parametrize("ending", ["png", "jpg", "bmp"])
+def test_a_picture_lies_where_its_world_file_and_prj_say(tmp_path: Path, ending: str) -> None:
+    dem = written(tmp_path / "dem.tif", GROUND)
+    photo = load(dem, photo=str(picture(tmp_path / f"p.{ending}", COLOURS))).photo
+    assert photo is not None
+    assert np.abs(photo.astype(int) - COLOURS).mean() < (5 if ending == "jpg" else 0.1)
+    heights = load(picture(tmp_path / "h.png", (GROUND * 10).astype(np.uint16)), height_scale=0.1)
+    assert heights.grid == load(dem).grid
+    np.testing.assert_allclose(heights.elevation_m, GROUND, atol=0.1)
+
+
+def test_a_picture_shows_nothing_where_it_is_transparent(tmp_path: Path) -> None:
+    dem = written(tmp_path / "dem.tif", GROUND)
+    for bands in (np.dstack([COLOURS, opaque()]), np.dstack([COLOURS[..., 1], opaque()])):
+        source = load(dem, photo=str(picture(tmp_path / "p.png", bands)))
+        assert not source.photo[HOLE].any()
+        assert not source.classes[HOLE].any()
+
+
+def with_alpha(path: Path, dtype: str, **profile: Any) -> Path:
+    bands = np.stack([GROUND.astype(dtype), opaque().astype(dtype)])
+    return written(path, bands, dtype, alpha="yes", **profile)
+
+
+def masked(path: Path) -> Path:
+    with rasterio.open(written(path, GROUND, nodata=-1.0), "r+") as file:
+        file.write_mask(opaque())
+    return path
+
+
+def lossy(path: Path) -> Path:
+    copy(written(path.with_suffix(".tif"), GROUND, "int16"), path.with_suffix(".jp2"), driver="JP2OpenJPEG")
+    return path.with_suffix(".jp2")
+
+
+def in_unit(path: Path, unit: str) -> Path:
+    with rasterio.open(written(path, GROUND), "r+") as file:
+        file.units = (unit,)
+    return path
+
+
+def said(path: Path, name: str, content: str | bytes) -> Path:
+    (path.parent / name).write_bytes(content if isinstance(content, bytes) else content.encode())
+    return path.parent / name
+
+
+ASC = "ncols 3\nnrows 2\nxllcorner 0\nyllcorner 0\ncellsize 5\nNODATA_value -9999\n1 2 3\n4 5 6\n"
+REFUSED: dict[str, tuple[Callable[[Path], Path], str]] = {
+    "alpha of floats": (lambda p: with_alpha(p, "float32"), "has an alpha band of float32, expected bytes"),
+    "alpha and a value": (lambda p: with_alpha(p, "uint8", nodata=0), r"a no-data value \(0\) and a mask or alpha"),
+    "mask and a value": (masked, r"a no-data value \(-1\) and a mask"),
+    "lossy JPEG 2000": (lossy, "is compressed with loss, expected exact numbers"),
+    "lossy LERC": (lambda p: written(p, GROUND, compress="lerc", MAX_Z_ERROR=1.0), "is compressed with loss"),
+    "unknown unit": (lambda p: in_unit(p, "0.1 m"), r"heights in '0\.1 m', an unknown unit; set terrain\.height"),
+    "colours": (lambda p: written(p, np.stack([GROUND] * 3), "uint8"), "gdal_calc.py unpacks heights from colours"),
+    "no place": (
+        lambda p: written(p, GROUND, transform=None), r"how large a cell is; set terrain\.resolution_m",
+    ),
+    "no corner": (
+        lambda p: said(p, "a.asc", ASC.replace("xllcorner 0\nyllcorner 0\n", "")), "header needs xllcorner",
+    ),
+    "degrees and minutes": (
+        lambda p: said(p, "a.asc", "north: 47:00:00N\nsouth: 46:59:59N\neast: 9:00:03E\nwest: 9:00:00E\nrows: 1\n"
+                       "cols: 3\n1 2 3\n"),
+        "its header says north '47:00:00N', expected a number",
+    ),
+    "a header alone": (lambda p: said(p, "a.csv", "x,y,z\n"), "its points have 0 different x"),
+    "PCRaster": (lambda p: said(p, "a.map", b"RUU CROSS SYSTEM MAP FORMAT" + bytes(300)), "is a map of PCRaster;"),
+    "UTF-16": (lambda p: said(p, "a.xyz", "1 2 3\n".encode("utf-16")), "is text in UTF-16; .* save it as UTF-8"),
+    "an image of a ROS map": (lambda p: said(p, "a.pgm", "P5\n2 2\n255\n1234"), r"name the \.yaml of the map"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", REFUSED)
+def test_a_terrain_is_refused_by_what_it_holds(tmp_path: Path, name: str) -> None:
+    make, words = REFUSED[name]
+    with pytest.raises(TerrainError, match=words) as told:
+        load(make(tmp_path / "a.tif"))
+    assert "\n" not in str(told.value)
+
+
+def test_a_setting_that_is_named_leads_to_a_load(tmp_path: Path) -> None:
+    for unit, metres in (("0.1 m", 0.1), ("yards", 1.0), ("decimeters", None)):
+        factor = {"yards": 0.9144, "decimeters": 0.1}.get(unit, 1.0) * (metres or 1.0)
+        heights_m = load(in_unit(tmp_path / "a.tif", unit), height_scale=metres).elevation_m
+        np.testing.assert_allclose(heights_m, GROUND * factor, rtol=1e-5)
+    source = load(written(tmp_path / "b.tif", GROUND, transform=None), resolution_m=5.0)
+    np.testing.assert_array_equal(source.elevation_m, GROUND)
+    assert (source.grid.crs, source.grid.resolution_m) == ("local", 5.0)
+    assert any(note.startswith("! the file has a system, but no place in it") for note in source.notes)
+
+
+@pytest.mark.parametrize("name", ["a.map", "a.yaml", "a.csv", "a.npz"])
+def test_a_raster_of_any_name_is_known_by_its_beginning(tmp_path: Path, name: str) -> None:
+    written(tmp_path / "a.tif", GROUND).rename(tmp_path / name)
+    np.testing.assert_array_equal(load(tmp_path / name).elevation_m, GROUND)
+
+
+@given(st.binary(max_size=12), st.sampled_from([b".", b" ", b"a", b"_", b":", b"\xff"]), st.integers(1, 5))
+def test_a_word_of_a_header_has_one_reading(begin: bytes, middle: bytes, many: int) -> None:
+    """Signs and letters follow each other, and no sign is a letter: a match has no two ways to try."""
+    word = begin + middle * many
+    is_word = re.fullmatch(rb"[^A-Za-z0-9_]*[A-Za-z_]+", word) and not re.search(
+        rb"(^|[^A-Za-z_])(nan|inf|infinity)$", word, re.IGNORECASE
+    )
+    assert bool(_HEADER_WORD.fullmatch(word)) == bool(is_word)
+
+
+def test_a_row_that_begins_with_the_word_for_a_void_is_no_header(tmp_path: Path) -> None:
+    head = "ncols 2\nnrows 2\nxllcorner 0\nyllcorner 0\ncellsize 5\nNODATA_value "
+    for void in ("null", "nan", "inf"):
+        (tmp_path / "a.asc").write_text(f"{head}{void}\n{void} 2\n3 4\n")
+        np.testing.assert_array_equal(load(tmp_path / "a.asc").elevation_m, [[np.nan, 2], [3, 4]])
+
+
+def test_a_photo_that_cannot_be_meant_is_refused(tmp_path: Path) -> None:
+    dem = written(tmp_path / "dem.tif", GROUND)
+    bands = np.moveaxis(COLOURS, -1, 0).astype(np.int16) * 20
+    bands[:, 40:60] = -9999
+    turned = Image.Exif()
+    turned[0x112] = 6
+    Image.fromarray(COLOURS).save(tmp_path / "turned.jpg", exif=turned)
+    for path, words in (
+        (written(tmp_path / "void.tif", bands, "int16"), "holds -9999, which is no brightness: gdal_edit.py"),
+        (tmp_path / "turned.jpg", "has EXIF orientation 6, expected 1"),
+    ):
+        with pytest.raises(TerrainError, match=words):
+            load(dem, photo=str(path))
+    shutil.copy(picture(tmp_path / "p.png", COLOURS), tmp_path / "bare.png")
+    assert any("has no place of its own" in note for note in load(dem, photo=str(tmp_path / "bare.png")).notes)
+    with rasterio.open(written(tmp_path / "bgr.tif", bands.clip(0, 255), "uint8"), "r+") as file:
+        file.colorinterp = (ColorInterp.blue, ColorInterp.green, ColorInterp.red)
+    photo = load(dem, photo=str(tmp_path / "bgr.tif")).photo
+    np.testing.assert_array_equal(photo, np.moveaxis(bands.clip(0, 255)[::-1], 0, -1))
+
+
+@pytest.mark.parametrize("side", [40, 60, 120])
+def test_no_level_patch_of_a_small_file_becomes_ground_in_silence(side: int) -> None:
+    heights_m = hills(5, 90)[:side, :side].round().astype(np.float32)
+    found = level_ground(heights_m)
+    assert found.mask.any() or found.uncertain > 0.001
+
+
+# --- zones ----------------------------------------------------------------------------------------------------
+
+BOX, INNER, CORE = shapely.box(5.2, 5.2, 25.2, 25.2), shapely.box(8.2, 8.2, 22.2, 22.2), shapely.box(12, 12, 15, 15)
+NODES = "".join(f'<node id="{n}" lat="{46.94 + n % 2 / 1e3}" lon="{9.001 + n // 2 / 1e3}"/>' for n in range(4))
+
+
+def osm(refs: list[int], tag: str) -> str:
+    nodes = "".join(f'<nd ref="{n}"/>' for n in refs)
+    return f'<?xml version="1.0"?><osm version="0.6">{NODES}<way id="7">{nodes}{tag}</way></osm>'
+
+
+def test_an_island_in_a_hole_is_closed_and_a_hole_in_a_hole_is_asked_about(tmp_path: Path) -> None:
+    nested = shapely.MultiPolygon([BOX.difference(INNER), CORE])
+    pace, _ = painted([ZoneConfig(kind="forbidden", file=geojson(tmp_path / "a.geojson", [feature(nested)]))])
+    assert pace[13, 13] == pace[6, 6] == np.inf
+    assert pace[10, 10] < np.inf
+    rings = shapely.Polygon(BOX.exterior, [INNER.exterior, CORE.exterior])
+    with pytest.raises(TerrainError, match=r"feature 0 cannot be used: a hole of it lies in another"):
+        painted([ZoneConfig(kind="forbidden", file=geojson(tmp_path / "b.geojson", [feature(rings)]))])
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (osm([0, 1, 3, 2], '<tag k="natural" v="water"/>'), "way 7 is an area, but its ring is not closed"),
+        ("#saved by Mission Planner\n46.9\t9\n", r"fence of Mission Planner .* save it as \.waypoints"),
+        ("none\n1\n   9.0  46.9\n   9.1 46.9\nEND\nEND\n", "an area of Osmosis"),
+        ("\0\0\0\r\n\tOSMHeader", "osmium cat"),
+        ('{"version": 0.6, "generator": "Overpass API", "elements": []}', "an answer of Overpass as JSON"),
+    ],
+)
+def test_a_drawing_of_others_is_refused_by_what_helps(tmp_path: Path, text: str, words: str) -> None:
+    (tmp_path / "zone.any").write_text(text)
+    with pytest.raises(TerrainError, match=words):
+        painted([ZoneConfig(kind="forbidden", file=str(tmp_path / "zone.any"))])
+
+
+def test_a_distance_under_another_name_is_refused(tmp_path: Path) -> None:
+    file = geojson(tmp_path / "a.geojson", [feature(shapely.Point(20.5, 20.5), buffer_m=50)])
+    with pytest.raises(TerrainError, match="its buffer_m is '50', expected metres as radius, diameter or width"):
+        painted([ZoneConfig(kind="forbidden", file=file)], UTM)
