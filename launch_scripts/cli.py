@@ -54,7 +54,7 @@ class Root(TyperGroup):
       route ...             Find a route
       terrain ...           Inspect and convert terrain
 
-    More: swarm help --all
+    More (swarm help --all):
     `swarm COMMAND -h` explains a command. SWARM_CONNECT and other variables
     stand for options (docs/operate/run.md).
     """
@@ -71,7 +71,7 @@ class Root(TyperGroup):
         print("Usage: swarm COMMAND ...\n")
         for line in text.splitlines():
             more = line.startswith("More")
-            print(textwrap.fill(f"{line}  {others}", 79, subsequent_indent=" " * 24) if more else line)
+            print(textwrap.fill(f"{line} {others}", 79, subsequent_indent="  ") if more else line)
 
 
 app = typer.Typer(

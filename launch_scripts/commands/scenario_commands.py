@@ -114,6 +114,7 @@ def _settings(path: Path, chosen: Choices) -> dict[str, Any]:
         "name": name[:40] or "unnamed",
         "seed": 1,
         "seconds": chosen.seconds,
+        "time_scale": 1.0,
         "terrain": terrain,
         "cost": cost if chosen.preset else {**cost, "max_slope_deg": 35.0},
         "planner": {"places": True},

@@ -111,6 +111,11 @@ def _say(*lines: str) -> None:
         console.print(line, highlight=False, markup=False, soft_wrap=True)
 
 
+def _say_written(**files: Path | None) -> None:
+    """Names the files which a command has written: `cost: cost.tif`."""
+    _say(*(f"{what}: {path}" for what, path in files.items() if path is not None))
+
+
 def _crs_name(grid: GridSpec) -> str:
     if len(grid.crs) < 60:
         return grid.crs
@@ -167,6 +172,7 @@ def cost(
         f" (median {np.median(finite):.3g}), digest {terrain.digest}"
     )
     _say(_shares(terrain), *lines_of(*notes_and_doubts(terrain, facts_of(terrain))))
+    _say_written(cost=out, picture=picture)
 
 
 @command(app)
@@ -217,7 +223,8 @@ def generate(
     if photo is not None:
         write_raster(photo, [terrain.photo[..., n] for n in range(3)], grid, photometric="rgb")
     _draw(terrain, picture, f"synthetic, seed {seed}")
-    console.print(f"{rows} x {cols} cells of {resolution_m:g} m, relief {relief_m:g} m, seed {seed}: {out}")
+    _say(f"{rows} x {cols} cells of {resolution_m:g} m, relief {relief_m:g} m, seed {seed}")
+    _say_written(terrain=out, photo=photo, picture=picture)
 
 
 @command(app)
@@ -266,15 +273,15 @@ def reach(
         if found.fastest_s is not None:
             facts["fastest_s"] = round(found.fastest_s, 2)
         console.print_json(json.dumps(facts))
-    elif found.fastest_s is not None:
+        return
+    if found.fastest_s is not None:
         best = f"the best takes {found.fastest_s:.0f} s"
-        _say(f"{found.share:.1%} of the cells are on a way of at most {longest_s:.0f} s; {best}", found.rule)
+        said = f"{found.share:.1%} of the cells are on a way of at most {longest_s:.0f} s; {best}"
     else:
         furthest = f"{longest_s:.0f} s from the furthest"
-        _say(
-            f"from {found.share:.1%} of the cells, in {median_s:.0f} s from the median one and {furthest}",
-            found.rule,
-        )
+        said = f"from {found.share:.1%} of the cells, in {median_s:.0f} s from the median one and {furthest}"
+    _say(said, found.rule)
+    _say_written(reach=out)
 
 
 @command(app)
@@ -319,6 +326,7 @@ def classify(
         write_raster(out, [terrain.classes], terrain.grid, descriptions=["class"])
     _draw(terrain, picture, f"{photo.name} on {elevation.name}")
     _say(*lines_of(*notes_and_doubts(terrain, facts_of(terrain))))
+    _say_written(classes=out, picture=picture)
 
 
 def _compare(terrain: Terrain, path: Path) -> None:

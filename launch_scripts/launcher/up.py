@@ -386,7 +386,7 @@ class _Run:
         the numbers at the end have them."""
         since_s = time.monotonic() - self._options.began_s - (self._startup_s or 0.0)
         if self._startup_s is None:
-            waits = f", waits for {', '.join(missing) or 'the rest of the swarm'}" * (len(missing) < 4)
+            waits = f", waits for {', '.join(missing) or 'the first route'}" * (len(missing) < 4)
             return f"{self._scenario.name}: starting, {up} processes are up{waits}, {since_s:.0f} s"
         of = "" if self._outlasts else self._limit(" of")
         until = ", until the live view is closed, or Ctrl-C" if self._outlasts else ""

@@ -51,6 +51,8 @@ KINDS: Mapping[str, str] = {
     "restarted": "restarted",  # a process was started again after it had ended
 }
 """The word on the wire -> what people call it. Serious is what must not be, or stops a part of the run."""
+OF_MANY: Mapping[str, str] = {"behind": "overloaded machine"}
+"""Cause of an alarm that many processes have."""
 EVIDENCE: Mapping[str, tuple[Topic, ...]] = {"down": (), "target-lost": (STATUS, POSE)}
 """Kind -> the topics that open and close it, beside liveliness tokens; `STATS` of all others."""
 
@@ -95,15 +97,20 @@ class Alarm:
         return KINDS.get(self.kind, self.kind)
 
     @property
+    def lasted_s(self) -> float | None:
+        """Seconds from its beginning to its end, or to its last evidence; None if they are not known."""
+        end_s = self.heard_s if self.over_s is None else self.over_s
+        return None if self.since_s is None or end_s is None else max(end_s - self.since_s, 0.0)
+
+    @property
     def when(self) -> str:
         """In words: `for 19 min`, `at 14:22:10`, `at 14:22:10, for 86 s`."""
-        end_s = self.heard_s if self.over_s is None else self.over_s
-        lasted = None if self.since_s is None or end_s is None else Duration(max(end_s - self.since_s, 0.0))
+        lasted = None if self.lasted_s is None else Duration(self.lasted_s)
         if self.over_s is not None:
             if self.since_s is None:
                 return f"until {self._at(self.over_s)}"
             return f"at {self._at(self.since_s)}" + (f", for {lasted}" if self.over_s > self.since_s else "")
-        last = f"last report at {self._at(end_s)}" if self.is_old and end_s is not None else ""
+        last = f"last report at {self._at(self.heard_s)}" if self.is_old and self.heard_s is not None else ""
         return ", ".join(filter(None, ("" if lasted is None else f"for {lasted}", last)))
 
     def _at(self, run_s: float) -> str:

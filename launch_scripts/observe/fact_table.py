@@ -5,12 +5,11 @@ Every display of a fact takes its label and its text from here, so that it reads
 
 from __future__ import annotations
 
-import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, Generic, TypeVar
 
-from launch_scripts.observe.alarms import SERIOUS, Alarm
+from launch_scripts.observe.alarms import OF_MANY, SERIOUS, Alarm
 from launch_scripts.observe.run_state import RunState, TargetLine
 from launch_scripts.observe.summed_counts import CertifiedGap, gap_text, percent
 from launch_scripts.plain_text import Duration, first_of, number_of
@@ -195,24 +194,36 @@ def lines_of(alarms: Iterable[Alarm], grid: GridSpec, most: int) -> list[str]:
     return [*found[:most], f"... {len(found) - most} more"] if len(found) > most else found
 
 
-def grouped(alarms: Iterable[Alarm], grid: GridSpec) -> list[tuple[str, list[Alarm]]]:
-    """Lines for people, and the alarms of each: many of a kind, all over or all not, are in one line."""
-    kinds: dict[tuple[str, bool], list[Alarm]] = {}
+def grouped(alarms: Iterable[Alarm], grid: GridSpec) -> list[tuple[str, list[str]]]:
+    """Lines for people, and the lines that each sums up. Many alarms of a kind, all over or all not, are in one
+    line; among its own lines, many alarms of one process are in one, too."""
+    return [
+        (line, [own for own, _ in _summed(of_kind, lambda alarm: alarm.about, grid)] if len(of_kind) > 1 else [])
+        for line, of_kind in _summed(alarms, lambda alarm: (alarm.kind, alarm.lasts), grid)
+    ]
+
+
+def _summed(
+    alarms: Iterable[Alarm], key: Callable[[Alarm], Hashable], grid: GridSpec
+) -> Iterator[tuple[str, list[Alarm]]]:
+    """Returns lines and the alarms of each: many alarms of one key are in one line."""
+    keys: dict[Hashable, list[Alarm]] = {}
     for alarm in alarms:
-        kinds.setdefault((alarm.kind, alarm.lasts), []).append(alarm)
-    found: list[tuple[str, list[Alarm]]] = []
-    for of_kind in kinds.values():
-        many = len(of_kind) > _SAID_SINGLY
-        found += [(together(of_kind), of_kind)] if many else [(each.line(grid), [each]) for each in of_kind]
-    return found
+        keys.setdefault(key(alarm), []).append(alarm)
+    for some in keys.values():
+        if len(some) > _SAID_SINGLY:
+            yield together(some), some
+        else:
+            yield from ((each.line(grid), [each]) for each in some)
 
 
 def together(alarms: Sequence[Alarm]) -> str:
     """Many alarms of one kind in a line."""
-    first = min(alarms, key=lambda alarm: math.inf if alarm.since_s is None else alarm.since_s)
-    about = first_of(list(dict.fromkeys(alarm.about for alarm in alarms)))
-    when = ("the longest " if first.lasts else "over, the first ") + (first.when or "now")
-    return f"{first.label}: {len(alarms)} times, {about}, {when}"
+    longest = max(alarms, key=lambda alarm: alarm.lasted_s or 0.0)
+    names = list(dict.fromkeys(alarm.about for alarm in alarms))
+    cause = f" ({OF_MANY[longest.kind]})" if longest.kind in OF_MANY and len(names) > _SAID_SINGLY else ""
+    when = f"the longest {longest.when or 'now'}{cause}"
+    return f"{longest.label}: {len(alarms):,} times, {first_of(names)}, {when}"
 
 
 def for_report(state: RunState) -> dict[str, Any]:

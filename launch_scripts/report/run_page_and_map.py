@@ -37,6 +37,7 @@ from launch_scripts.observe.fact_table import WELL, count, grouped, left_behind
 from launch_scripts.observe.palette import colours_of_groups, rgb, round_length, said_length
 from launch_scripts.observe.run_folder import REPORT_FILE, SCENARIO_FILE, read_report
 from launch_scripts.observe.summed_counts import percent
+from launch_scripts.plain_text import first_of
 from launch_scripts.report.plots_and_cards import PLOTS, STYLE, cards, draw_plot, halo, headline, saved
 from launch_scripts.report.report_and_tracks import TABLES, TRACKS_FILE, RunTracks, Track, flat, read_tracks
 from launch_scripts.report.run_gis_layers import groups_of
@@ -88,7 +89,7 @@ def draw_map(axes: Axes, tracks: RunTracks, report: Mapping[str, Any]) -> None:
     last = {track.id: track for track in tracks.targets if len(track.time_ns)}
     for track in tracks.targets:
         line, is_last = in_km(track, grid, step), track is last.get(track.id)
-        named = "target" if track is next(reversed(last.values()), None) else None
+        named = f"target{untracked(tracks, report)}" if track is next(reversed(last.values()), None) else None
         _draw_track(
             axes, f"target:{track.id}", line, palette.RED, 1.8, "D" if is_last else "", label=named, zorder=6
         )
@@ -101,6 +102,13 @@ def draw_map(axes: Axes, tracks: RunTracks, report: Mapping[str, Any]) -> None:
     )  # fmt: skip
     axes.grid(False)
     _draw_scale(axes, width_km, height_km)
+
+
+def untracked(tracks: RunTracks, report: Mapping[str, Any]) -> str:
+    """Names the targets which are not on a map, for its legend; empty if all are there."""
+    drawn = {track.id for track in tracks.targets}
+    missing = [id for id in report.get("by_target") or () if id not in drawn]
+    return f" (not drawn, no tracker: {first_of(missing)})" if missing else ""
 
 
 def draw_border(axes: Axes, ground: GroundPicture, tracks: RunTracks) -> None:
@@ -408,9 +416,9 @@ def _alarms(report: Mapping[str, Any]) -> list[tuple[str, bool, list[str]]]:
     began_ns = None if began is None else round(datetime.fromisoformat(began).timestamp() * NS_PER_S)
     told = [replace(each, began_ns=began_ns) for each in msgspec.convert(report.get("alarms") or [], list[Alarm])]
     return [
-        (line, serious, [each.line(grid) for each in alarms] if len(alarms) > 1 else [])
+        (line, serious, parts)
         for serious in (True, False)
-        for line, alarms in grouped((each for each in told if each.serious == serious), grid)
+        for line, parts in grouped((each for each in told if each.serious == serious), grid)
     ]
 
 
@@ -452,6 +460,7 @@ def _map(folder: Path, report: Mapping[str, Any]) -> dict[str, Any] | None:
             (width_km * scale, height_km * scale), (0, 0, 1, 1), lambda axes: draw_map(axes, tracks, report)
         ),
         "groups": colours_of_groups(report),
+        "untracked": untracked(tracks, report),
         "marks": len(tracks.marks.cells),
         "ground": _picture(folder / GROUND_FILE, "image/webp"),
         "learned": _picture(folder / LEARNED_FILE, "image/png"),

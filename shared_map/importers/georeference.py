@@ -304,7 +304,7 @@ def plan_grid(
             f" {MAX_SPAN_DEG:g}; crop it"
         )
     width, height = pixel_m(transform, rows, cols, crs, target)
-    notes = [f"{rows} x {cols} pixels of {width:.4g} x {height:.4g} m in {crs_name(crs)}"]
+    notes = [f"{rows} x {cols} pixels of {height:.4g} x {width:.4g} m in {crs_name(crs)}"]
     north_up = transform.b == transform.d == 0 and transform.a > 0 > transform.e
     if not north_up:
         mirrored = "! " * (transform.determinant > 0 and transform.a < 0)

@@ -18,6 +18,7 @@ from swarm.errors import ConfigError
 from swarm.grid import TILE_CELLS, GridSpec
 from swarm.wire.messages import map_data, planning
 from swarm.wire.messages.vehicles import LONGEST_OBSTACLE_LEASE_S, MOST_M_PER_S, MOST_RADIUS_M, Obstacle
+from swarm.wire.route_columns import RouteStatus
 from swarm.wire.topics import DIGEST, MARKS, OBSTACLE, PLACE_ROUTE, PUSHED_ROUTE, asker_of
 
 if TYPE_CHECKING:
@@ -193,7 +194,8 @@ class Vehicle(Reported):
         speed_m_per_s  by the wall clock
 
         Raises ConfigError on a location outside the terrain and on a value that is not a number; the previous
-        position is kept.
+        position is kept. Lethal ground raises nothing, as only planners know the map: a vehicle there gets routes
+        with status "lethal_start", and, if it follows a target, a problem.
         """
         session = self._session
         with session.lock:
@@ -346,6 +348,10 @@ class Vehicle(Reported):
         except (ValueError, IndexError) as error:
             self._session.problem("routes_refused", f"the planner of {self._target} answers nonsense: {error}")
             return
+        if given.status is RouteStatus.LETHAL_START:
+            where = "row {}, col {}".format(*self._session.frame.grid.row_col(given.start))
+            text = f"vehicle {self.id} is on lethal ground, {where}: no route leads from there"
+            self._session.problem("lethal_start", text)
         if self._route is not None and route.is_rest_of(self._route):
             return
         self._route = route

@@ -14,6 +14,7 @@ from support.map_strategies import set_of
 
 from launch_scripts.launcher.terminal_tables import plain_line
 from launch_scripts.observe import fact_table as facts
+from launch_scripts.observe.alarms import Alarm as SeenAlarm
 from launch_scripts.observe.latest_messages import LatestState, plan_of
 from launch_scripts.observe.recorder import BegunRoute, Recorder, Sampling, Thinned
 from launch_scripts.observe.summed_counts import CertifiedGap
@@ -456,7 +457,7 @@ def test_alarms_say_where_and_since_when_the_serious_first_and_many_of_a_kind_in
     state = recorder.summary(int(at_s * NS_PER_S))
     assert facts.alarm_lines(state, 9) == [
         "x: y it is, row 1, col 1, for 57 s",
-        "behind: 6 times, agent-a0, agent-a1, keeper-0 and 3 more, the longest for 48 s",
+        "behind: 6 times, agent-a0, agent-a1, keeper-0 and 3 more, the longest for 48 s (overloaded machine)",
     ]
     assert re.search(r"^collision: .*, row 1, col 1, at \d\d:\d\d:31$", facts.alarm_lines(state, 9, over=True)[2])
     recorder.alive(Peer("planner", "t1", 1), False, int(at_s * NS_PER_S))
@@ -477,3 +478,20 @@ def test_alarms_say_where_and_since_when_the_serious_first_and_many_of_a_kind_in
     ended = stats("planner", "t1", at_s=later_s, gauges={"ended": 1.0})
     hear(recorder, ended, at_s=later_s + 1)
     assert not [alarm for alarm in recorder.summary(int((later_s + 1) * NS_PER_S)).alarms if alarm.kind == "down"]
+
+
+def test_many_alarms_of_one_process_share_a_line_among_those_of_their_kind() -> None:
+    def behind(about: str, since_s: float, over_s: float) -> SeenAlarm:
+        return SeenAlarm("behind", about, f"{about} skips", since_s, over_s)
+
+    of_keeper = [behind("keeper-0", 10.0 * n, 10.0 * n + 1 + n % 3) for n in range(5)]
+    others = [behind("agent-a0", 3.0, 5.0), behind("planner-t0", 3.0, 4.0)]
+    [(line, parts)] = facts.grouped([*of_keeper, *others], GRID)
+    names = "keeper-0, agent-a0, planner-t0"
+    assert line == f"behind: 7 times, {names}, the longest at 20 s of the run, for 3 s (overloaded machine)"
+    assert parts == [
+        "behind: 5 times, keeper-0, the longest at 20 s of the run, for 3 s",
+        "behind: agent-a0 skips, at 3 s of the run, for 2 s",
+        "behind: planner-t0 skips, at 3 s of the run, for 1 s",
+    ]
+    assert facts.grouped(others, GRID) == [(line, []) for line in parts[1:]], "few are said one by one"

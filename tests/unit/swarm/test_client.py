@@ -277,6 +277,18 @@ def test_who_follows_a_target_gets_a_new_route_when_it_moves_and_none_while_noth
     assert routes.closed
 
 
+def test_a_follower_on_lethal_ground_is_told_where_it_is(world: Swarm) -> None:
+    program = Program(world)
+    rover = program.swarm.vehicle("rover")
+    cell = GRID.cell(30, 3)
+    rover.at(*GRID.centre_m(cell))
+    rover.mark([cell], lethal=True)
+    routes = rover.follow("t")
+    world.run(5.0)
+    assert (routes.newest.status, routes.newest.ok) == ("lethal_start", False)
+    assert program.problems == ["vehicle rover is on lethal ground, row 30, col 3: no route leads from there"]
+
+
 def test_a_planner_that_goes_is_told_once_and_its_successor_followed_without_a_word(world: Swarm) -> None:
     program = Program(world)
     rover = program.swarm.vehicle("rover")
