@@ -99,6 +99,8 @@ PULL = pull_routes.pull_routes
 """Only for planners that pull their routes."""
 
 _POLL_S = 0.1
+"""Interval of looks for kernels that another process compiles; five times as long once planning has begun. Chosen,
+not measured."""
 _BUILDERS = "builders.lock"
 """Each builder holds this lock shared, so that others see that one is at work."""
 

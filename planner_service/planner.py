@@ -32,7 +32,9 @@ from swarm.wire.messages.vehicles import Chasers
 from swarm.wire.route_columns import Route, RouteBatch
 
 FOLLOWER_LEASE_NS = 5 * NS_PER_S
+"""Agents name their vehicles once a second (`topics.CHASERS`): five names in a row are missing."""
 STATUS_NS = NS_PER_S // 2
+"""Interval of the status (`topics.STATUS`)."""
 MAX_GAP = 1.5
 """A served route whose certified gap (cost over proven bound) exceeds this asks for a full growth."""
 MOST_ROUTES = MOST_VEHICLES
@@ -117,7 +119,7 @@ class Planner:
         self._intake = MapIntake(cost_map, self.followers)
         self._watch = watch
         # (target cell, map version) of the tree's last update.
-        self._told: tuple[int, int] | None = None
+        self._taken_in: tuple[int, int] | None = None
         # When the full growth under way was begun, and the map's changes since; None and empty without one.
         self._growing_since_ns: int | None = None
         self._dirty_since_snapshot: list[Window] = []
@@ -222,7 +224,7 @@ class Planner:
             *(news[0], self._dirty_since_snapshot, news[1]),
             self.followers.cells,
         )
-        self._told = news
+        self._taken_in = news
         self._wants_full = False  # all that happened until now is in what `adopt` says
         self._record_growth(took_ns)
         if grown.map_version == news[1] and grown.target_cell == news[0]:
@@ -246,7 +248,7 @@ class Planner:
     @property
     def knows_map(self) -> bool:
         """Returns True if routes follow the current map."""
-        return self._told is None or self._told[1] == self._cost_map.version
+        return self._taken_in is None or self._taken_in[1] == self._cost_map.version
 
     # --- the tree -----------------------------------------------------------------------------------------------
 
@@ -258,9 +260,9 @@ class Planner:
                 self._learn_map(now_ns)
             return []  # the first growth takes the map as it is then, whatever changed before
         now_known = (pose.cell, self._cost_map.version)
-        moved = self._told is None or pose.cell != self._told[0]
-        self.tree.times.note_tick(moved and self._told is not None)
-        if moved or (now_known != self._told and self._may_not_wait(now_ns)):
+        moved = self._taken_in is None or pose.cell != self._taken_in[0]
+        self.tree.times.note_tick(moved and self._taken_in is not None)
+        if moved or (now_known != self._taken_in and self._may_not_wait(now_ns)):
             self._take_in(now_known, now_ns)
         if (self._wants_full or self.tree.wants_full) and self._growing_since_ns is None:
             return [self._grow(now_ns)]
@@ -301,7 +303,7 @@ class Planner:
             self.tree.expect([follower.cell for _, follower in self.followers.all_items()])
         began_ns = self._now()
         update = self.tree.update(self._cost_map.pace_s_per_m, news[0], dirty, news[1])
-        self._told = news
+        self._taken_in = news
         self._timed(update, self._now() - began_ns, now_ns)
         self._changed(update, dirty, now_ns)
 
@@ -315,11 +317,11 @@ class Planner:
         return dirty
 
     def _grow(self, now_ns: int) -> Work:
-        assert self._told is not None
+        assert self._taken_in is not None
         self._growing_since_ns = now_ns
         self._dirty_since_snapshot = []
         self._wants_full = False
-        return Work(self.tree.full_job(self._told[0]))
+        return Work(self.tree.full_job(self._taken_in[0]))
 
     def _changed(self, update: Update, dirty: Sequence[Window], now_ns: int) -> None:
         """The tree is another than before."""
@@ -370,7 +372,7 @@ class Planner:
         max_cells = min(request.max_cells or most, most) if most < self._grid.cells else request.max_cells
         if (search := self._under_way) is not None:
             ways, vehicles = self._ways, request.vehicles
-            routes = self._known(
+            routes = self._on_current_map(
                 lambda: search.routes(ways, cells, vehicles, max_cells, self.tree.map_version), now_ns
             )
         else:
@@ -391,9 +393,9 @@ class Planner:
 
     def _read(self, cells: list[int], max_cells: int, now_ns: int) -> RouteBatch:
         """Routes off the tree."""
-        return self._known(lambda: self.tree.routes(cells, max_cells), now_ns)
+        return self._on_current_map(lambda: self.tree.routes(cells, max_cells), now_ns)
 
-    def _known(self, find: Callable[[], RouteBatch], now_ns: int) -> RouteBatch:
+    def _on_current_map(self, find: Callable[[], RouteBatch], now_ns: int) -> RouteBatch:
         """Routes by `find`. If a waiting change of the map concerns them, it is applied and they are found again.
 
         Every route that is given to anybody comes through here.
@@ -401,8 +403,8 @@ class Planner:
         routes = find()
         if not self._intake.concerns(routes):
             return routes
-        if self._told is not None and self.tree.ready:
-            self._take_in((self._told[0], self._cost_map.version), now_ns)
+        if self._taken_in is not None and self.tree.ready:
+            self._take_in((self._taken_in[0], self._cost_map.version), now_ns)
         elif self._under_way is not None:
             self._learn_map(now_ns)
         else:
@@ -515,7 +517,7 @@ class Planner:
 
     def _place(self, searcher: Searcher, id: str, follower: Follower, now_ns: int) -> RouteBatch:
         at, most = follower.cell, follower.max_cells
-        return self._known(lambda: searcher.route(self._ways, id, at, most, self.tree.map_version), now_ns)
+        return self._on_current_map(lambda: searcher.route(self._ways, id, at, most, self.tree.map_version), now_ns)
 
     def _pushed(self, vehicle: str, route: Route, target_cell: int) -> planning.PushedRoute:
         return planning.PushedRoute(

@@ -6,6 +6,7 @@ import time
 from typing import Protocol
 
 NS_PER_S = 1_000_000_000
+"""Nanoseconds of a second."""
 _APART_NS, _TRIES = 100_000, 1000
 """Two readings that are further apart are taken again: the process was stopped between them."""
 

@@ -230,6 +230,7 @@ class GridSpec:
 
 
 _CODES = bytes(range(8))
+"""Every direction code: what is left of a route without these is none."""
 
 
 @lru_cache(maxsize=16)

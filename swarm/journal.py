@@ -32,6 +32,7 @@ from swarm.errors import DamagedError, StoreError, SwarmError
 from swarm.files import make_folder, sync_folder, writing
 
 DIGEST_BYTES = 8
+"""Bytes of a checksum: of damage one in 2^64 is missed. It is no defence against a forger."""
 _HEAD = struct.Struct("<32s8sQQ8s")
 _RECORD = struct.Struct("<I8s")
 SEAL_BYTES = _HEAD.size + DIGEST_BYTES

@@ -39,6 +39,8 @@ _MANY_WAIT = 0.025
 """Share of the vehicles. In free traffic fewer wait, and a third of the CPU time of 1,000 vehicles went into acts
 between ticks; in crowds more do (`bench crowd`). Up to 40 vehicles are so few that one may always wait."""
 _LONGEST_STEP_S = 0.5
+"""Time that counts between two ticks at most: after a pause vehicles drive on from where they were, without a leap.
+Chosen, not measured."""
 _PATIENCE, _PATIENCE_S = 8.0, 1.0
 """Longest wait behind vehicles that do not go on: in times of a cell, and in seconds; the longer counts."""
 _STALE_CELLS = 8

@@ -40,7 +40,9 @@ log = logging.getLogger(__name__)
 _ANSWER_S = 2.0
 """A planner's answer is waited for at most this time, or for several round trips where the link is slow."""
 _TRIPS = 3.0
+"""Round trips that an answer may take. Chosen, not measured."""
 _LONGEST_ANSWER_S = 8.0
+"""Bound on the wait for an answer, which doubles after each that did not come. Chosen, not measured."""
 _ROUTES, _COSTS = "route-", "cost-"
 """Tags of what we ask, each with a number."""
 

@@ -43,6 +43,7 @@ from vehicle_agent.start_cells import spawn_cells
 _MOST_STEPS_CELLS = 1 << 21
 """Each cell has eight steps: more would take seconds and gigabytes."""
 _ONE_WAY_SHARE = 0.01
+"""Share of the ground from which on a warning is worth its line. Chosen, not measured."""
 
 
 def files_of(scenario: Scenario) -> dict[str, str]:

@@ -265,7 +265,9 @@ def _check_open(scenario: Scenario, terrain: Terrain, cell: int, option: str, ot
 _MOST_BANDS = 200
 """Most areas of a file: more cannot be distinguished on a map."""
 _BAND_S = 600.0
+"""Time between two areas, unless --every-s says it. Chosen, not measured."""
 _SLACK_BANDS = 5
+"""Areas of a corridor, unless --every-s says it. Chosen, not measured."""
 
 
 @dataclass(frozen=True, eq=False)

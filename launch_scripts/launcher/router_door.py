@@ -36,9 +36,13 @@ FREE_TRIES = 32
 _FORGIVEN_PER_S = 0.5
 """Failures of an address that are forgotten each second: they keep Zenoh's listener busy for a twentieth of it."""
 _MOST_ADDRESSES = 1 << 14
+"""Addresses whose connections are counted: bounds the memory. New ones beyond are refused. Chosen, not measured."""
 _BACKLOG = 4096
+"""Connections that the kernel may keep until they are accepted; it cuts the number to net.core.somaxconn."""
 _LISTEN_WITHIN_S = 10.0
+"""Time for the thread of the door to listen, and to end. Chosen, not measured."""
 _RECORD, _HANDSHAKE, _CLIENT_HELLO = 5, 22, 1
+"""Bytes of a TLS record's header, its type of a handshake, and the handshake's type of a ClientHello (RFC 8446)."""
 
 
 def missing_of_hello(head: bytes) -> int:

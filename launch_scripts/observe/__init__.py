@@ -17,7 +17,8 @@
 | local_runs.py      | the runs of this user on this machine, each by a small file                              |
 | palette.py         | how pictures and the live view look                                                      |
 
-A new fact is one row in `FACTS`, and appears everywhere. Facts are counted by the process that does the counted
-work, and a restarted process continues its previous counts (`swarm.runtime.stats.carried`). All watchers therefore
-agree once messages have arrived, whenever they began to watch.
+A new fact is a field of `RunState` and a row in `FACTS`, which every report has; `LINES` and `IF_ANY` place it in
+the lines for people. Facts are counted by the process that does the counted work, and a restarted process continues
+its previous counts (`swarm.runtime.stats.carried`). All watchers therefore agree once messages have arrived,
+whenever they began to watch.
 """

@@ -124,7 +124,8 @@ FACTS: tuple[Fact[RunState], ...] = (
     Fact("messages_now_per_s", "messages/s", count, of="messages_per_s"),
     Fact("payloads_dropped", "payloads dropped", count),
 )
-"""Facts on show of a run. A new row appears everywhere; the docstring of `RunState` says what each means."""
+"""Facts of a run, which every report has; `LINES`, `IF_ANY` and `MUST_BE_ZERO` place them in the lines for people.
+The docstring of `RunState` says what each means."""
 
 TARGET_FACTS: tuple[Fact[TargetLine], ...] = (
     Fact("target", "target", _word, of="title"),

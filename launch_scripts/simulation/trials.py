@@ -35,6 +35,7 @@ _STUTTER = 0.01
 _SLOW_SEEDS = (6, 7)
 """Remainders by 8 of seeds with a slow link. One of the two also has processes stopped."""
 _SLOWEST_MS = 1000.0
+"""Greatest delay of a slow link. Chosen, not measured."""
 
 _PACKAGES = (
     "swarm",

@@ -21,6 +21,7 @@ CHEAPEST_S, DEAREST_S = np.float32(2.0**-40), np.float32(2.0**40)
 """Lowest and highest cost of a cell, s: a picosecond, 35,000 years. No path over the largest grid, and no quotient
 of two costs, therefore leaves float32."""
 _INF_BITS = np.int32(0x7F800000)
+"""Bits of inf in float32: larger ones are NaN."""
 _ONE = np.uint64(1)
 BLOCK = 1 << 10
 """Cells of a block, whose range is kept."""

@@ -30,10 +30,12 @@ RULE_OCTILE = 2
 """8 neighbours, diagonal steps sqrt(2) long."""
 
 NONE = np.uint8(255)
+"""Parent of a cell without a path: no direction code."""
 SQRT2 = np.float32(1.4142135623730951)
 SQRT2_EXACT = 1.4142135623730951
 INF = np.float32(np.inf)
 HUGE = np.float32(3.4028235e38)
+"""The largest finite float32."""
 WALL = np.float32(-np.inf)
 """While growing, the cost of a lethal cell. No minimum lifts it; and max(key, -WALL) is inf, an offer that no cell
 takes, without a branch."""

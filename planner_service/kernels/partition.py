@@ -47,17 +47,21 @@ BITS = 6
 SIDE = 1 << BITS
 """Cells of a tile's side: a tile with all that belongs to it stays in a core's own cache."""
 WIDE = SIDE + 2
+"""Side of a tile with one cell around it."""
 CELLS = SIDE * SIDE
 PIECES = 256
 """Pieces that a tile may have, one for each cell of its border and one of the root; names fit a byte."""
 INSIDE = SIDE - 1
+"""Bits of a row or column within its tile."""
 TOTAL, BEFORE, OFFSET = range(3)
 """Columns of `Tree.total`."""
 SUCCESSOR, STAMP = 6, 7
 """Columns of `Tree.successor`."""
 
 ROOT_PIECE = np.uint8(252)
+"""Name of the piece of the root: the first behind the 252 cells of a tile's border."""
 NO_PIECE = np.uint8(255)
+"""Name of the piece of a cell without a path."""
 
 CHECK, RELINK, RELINK_INTO, CUT_OFF, RECHECK, CHECKED_CUT_OFF, RECONNECTED = (
     np.uint8(1 << bit) for bit in range(7)

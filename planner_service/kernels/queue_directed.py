@@ -51,6 +51,7 @@ WIDTH = 0.9
 another, whatever the rounding: of the sum, of the product that finds the bucket, and of its factor, each at most
 2^-24 of the cost. Up to `_SURE` that is a tenth of a bucket."""
 _SURE = np.uint64(1 << 19)
+"""Bucket up to which the rounding of a cost stays within a tenth of a bucket: 2^19 widths times 3 * 2^-24."""
 BASE_BITS = 7
 """Buckets of each level: 2 to the power of this."""
 _DIGIT, _BASE = np.uint64(BASE_BITS), np.uint64(1 << BASE_BITS)
@@ -61,6 +62,7 @@ _NEAR, _MOST_INDEX = np.float32(2.0**30), np.float32(2.0**62)
 _FEW, _SHARE = np.uint64(8), np.uint64(5)
 """A bucket is served in parts while this number of its cells may lead into it, and of n cells n >> _SHARE more."""
 _ALL = np.float32(-1.0)
+"""Less than each cost: no cell of a batch is left out."""
 _SCRATCH = f"Tuple((u4[::1], i4[::1], u4[::1], Tuple((f4[::1], i4[::1])), u8[::1], {QUEUE}))"
 
 Steps = tuple[NDArray[np.float32], NDArray[np.int32]]

@@ -43,6 +43,7 @@ _ZERO = np.uint64(0)
 _ONE32 = np.float32(1.0)
 _ZERO32 = np.float32(0.0)
 _EVERY_BIT = np.uint64(0xFFFFFFFF)
+"""Mask of `put` where the places are a line, no circle."""
 _FAR = np.float32(1 << 30)
 """No bucket has a larger number, so that it fits int32."""
 CIRCLE = 1 << 9
@@ -57,9 +58,11 @@ _LAST = 1 << 20
 _SPARSE = np.uint64(32)
 """Buckets that hold fewer cells, in the mean of a circle, get wider."""
 _WIDER, _NARROWER = np.float32(8.0), np.float32(1 / 8)
+"""Factors by which the width of buckets is changed. Chosen, not measured."""
 _FEW, _AGAIN = np.uint64(1024), np.uint64(2)
 """Number of cells that may be served again in a bucket, and for each cell of it."""
 _ANY = np.uint64(1 << 62)
+"""More than are ever served: at the least width there is no limit."""
 _SCRATCH = f"Tuple((u4[::1], u4[::1], u4[::1], u4[::1], {QUEUE}))"
 
 Scratch = tuple[NDArray[np.uint32], NDArray[np.uint32], NDArray[np.uint32], NDArray[np.uint32], Queue]

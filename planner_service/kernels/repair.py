@@ -34,6 +34,7 @@ from planner_service.kernels.parents_from_costs import point_row_to_parents
 _NOBODY = np.int32(-1)
 _ONE = np.uint64(1)
 FINE_ROW = np.uint64(44)
+"""Bits of the fixed-point number by which a cell's row is found without a division."""
 _STRAIGHT = np.float32(1.0)
 _PART = np.uint64(64)
 """Cells of a row that are looked through at once."""

@@ -42,6 +42,7 @@ MOST_GOALS = 4096
 _GROWN_CELLS = 1 << 20
 """Cells that may be searched between two ticks: this bounds the decisions taken, the rest wait."""
 _MOST_DECISIONS = 8
+"""Decisions of a tick on small maps, where each takes little time. Chosen, not measured."""
 _STANDS = 1e30
 """Slowness of a target that stands still, as a finite number."""
 _MOST_CELLS = 1 << 21

@@ -76,6 +76,7 @@ class CostRange:
 
 
 _MANY = 1 << 11
+"""Classes: all that 11 bits name."""
 _LETHAL = 0x7F8
 """The class of inf."""
 

@@ -36,6 +36,7 @@ MOST_STRETCH = 0.02
 _LIKE_WGS84 = (4326, 4258, 4269)
 """Degrees within a metre of WGS 84's. Those of other datums PROJ has to move, for which it needs the datum."""
 _EARTH_M = 6_371_000.0
+"""Mean radius of the Earth: a radius within a hundredth of it is that of an ellipsoid of the Earth."""
 METRES = 'LOCAL_CS["image",UNIT["metre",1]]'
 """Coordinate system of what has no place on Earth."""
 HIGHEST_DEG = 85.0

@@ -21,7 +21,7 @@ from shared_map.importers.cover.land_cover import TABLES, some
 from shared_map.importers.georeference import METRES, Placed, check_metres, crs_of, overruled, own_system, plan_grid
 from shared_map.importers.raster_files import NOTES, Numbers, in_memory, middle_of, opened, sampled
 from shared_map.importers.terrain_sources import Source
-from shared_map.importers.water_and_voids import MOST_SAMPLED, looked_at, without
+from shared_map.importers.water_and_voids import MOST_SAMPLED, examined, voids_as_nan
 from shared_map.terrain.row_bands import Progress
 from swarm.config.ground import TerrainConfig
 from swarm.errors import TerrainError
@@ -155,7 +155,7 @@ def _heights(
     if dataset.count == 2:
         scale_notes.append("the file has two bands; heights are taken from the first")
     some = sampled(dataset, 1, MOST_SAMPLED).astype(np.float32).filled(np.nan)
-    voids, found, looks = looked_at(np.where(np.isfinite(some), some, np.float32(np.nan)), config, factor, offset)
+    voids, found, looks = examined(np.where(np.isfinite(some), some, np.float32(np.nan)), config, factor, offset)
     if voids and not placed.is_cells:  # of a second value of no height GDAL would make slopes
         if dataset.height * dataset.width > MAX_CELLS:
             listed = ", ".join(f"{void:g}" for void in voids)
@@ -163,7 +163,7 @@ def _heights(
                 f"terrain {path} has undeclared voids ({listed}): gdal_edit.py -a_nodata declares one"
             )
         known = np.where(dataset.read_masks(1) > 0, dataset.read(1).astype(np.float32), np.float32(np.nan))
-        whole = Numbers(without(known, voids), placed.transform, placed.crs)
+        whole = Numbers(voids_as_nan(known, voids), placed.transform, placed.crs)
         placed = replace(placed, dataset=in_memory(whole, files))
     stretch = placed.transform @ Affine.scale(dataset.width / found.shape[1], dataset.height / found.shape[0])
     flat = in_memory(Numbers(found.astype(np.float32), stretch, placed.crs), files)
@@ -171,7 +171,7 @@ def _heights(
     level = np.concatenate([values > 0 for _, values in seen])
     elevation_m = np.empty(grid.shape, np.float32)
     for rows, stored in placed.on_grid("average" if placed.grows else "bilinear", 1, "reading heights", progress):
-        elevation_m[rows] = without(stored, voids)
+        elevation_m[rows] = voids_as_nan(stored, voids)
         if (factor, offset) != (1.0, 0.0):
             elevation_m[rows] *= np.float32(factor)
             elevation_m[rows] += np.float32(offset)

@@ -35,9 +35,11 @@ from swarm.errors import TerrainError
 _NPZ_ARRAYS = ("elevation", "resolution_m", "dx", "dy", "xmin", "ymin", "ymax")
 _READ_ARRAYS = "elevation and resolution_m, or elevation, dx, dy, xmin and ymin (degrees)"
 _HEADER_BYTES = 4096
+"""Bytes of an array's header that NumPy parses; headers of grids have some 120."""
 _MOST_TABLE_BYTES = 1 << 20
 """Limit of an archive's table of contents."""
 _SHOWN_MEMBERS = 10
+"""Unread arrays that a sentence names at most. Chosen, not measured."""
 MAX_STEP = 1e7
 """Metres or degrees: a quarter of the way around the Earth."""
 SCALE_FACTOR = 9.0

@@ -18,7 +18,7 @@ import tomllib
 import warnings
 import zipfile
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
 from pathlib import Path
@@ -46,17 +46,21 @@ _HEADER_WORD = re.compile(rb"\W*(?!(nan|inf|infinity)$)[a-z_]+", re.IGNORECASE)
 """The first word of a line of the header of a grid as text; a value follows. Surfer's has lines of numbers."""
 _NUMBER = re.compile(rb"[-+]?((\d+\.?\d*|\.\d+)(e[-+]?\d+)?|inf|infinity|nan)", re.IGNORECASE)
 _SURFER_LINES = 5
+"""Lines of the header of Surfer's text grid: DSAA, size, ranges of x, y and z."""
 _VOIDS, _COUNTS = {"nodata_value", "nodata", "null"}, {"ncols", "nrows", "cols", "rows", "line 2"}
 """Header words of the no-data value, and of whole numbers; Surfer's header has lines without names."""
 _WORDS = {*_VOIDS, "type"}
 _HEADER_LINE_BYTES = 4096
+"""Limit of a line of a header: a file without line ends is not read as one line."""
 _TEXT_PIECE_BYTES = 4 << 20
+"""Bytes of a text grid that are checked at once: bounds the memory."""
 _HEAD_BYTES = 4096
 """Room for the comments before the root of an XML."""
 NOTES = "NOTES"
 """Tag of numbers which we have read ourselves: what people should know of them, a line each."""
-PLAIN = (".npz", ".csv", ".xyz")
-"""Endings of files whose numbers GDAL does not read, or not as they are (docs/design/terrain-import.md)."""
+PLAIN = {".npz": "read_npz", ".csv": "read_text_grid", ".xyz": "read_text_grid"}
+"""Endings of files whose numbers GDAL does not read, or not as they are (docs/design/terrain-import.md) -> their
+reader in `plain_grids`, which imports this module."""
 BAD_ARCHIVE = (
     zipfile.BadZipFile, zlib.error, lzma.LZMAError, NotImplementedError, RuntimeError, EOFError, ValueError,
     KeyError, OverflowError,
@@ -67,7 +71,10 @@ LONGEST_REASON = 200
 READ_ROWS = 512
 """Rows that are read at once."""
 _HGT_BYTES = 2 * 1201 * 1201, 2 * 3601 * 3601
+"""Two bytes for each height of a square degree, every 3 arc seconds or every one."""
 _MOST_TIMES, _DEEPEST = 32, 4
+"""Times that a .vrt may paint its pixels, and depth to which such files may name each other: bound the time.
+Chosen, not measured."""
 _LOSSY, _RAW = ("JPEG", "WEBP", "LOSSY"), ("EHdr", "ENVI")
 _MOST_LOSS = 0.5
 """Largest error of LERC that is exact: rounded, whole numbers are as they were."""
@@ -95,7 +102,7 @@ class Numbers(NamedTuple):
     notes: tuple[str, ...] = ("numbers which are read without GDAL",)
 
 
-def is_named(path: Path, endings: Sequence[str]) -> bool:
+def is_named(path: Path, endings: Collection[str]) -> bool:
     """Returns True if a file's ending says how it is read, and its beginning does not contradict."""
     if path.suffix.lower() not in endings or not path.is_file():
         return path.suffix.lower() in endings
@@ -161,9 +168,9 @@ def _georeferenced(path: Path, what: str, files: contextlib.ExitStack) -> Any:
 
     what = f"{what} {path}"
     if is_named(path, PLAIN):
-        from shared_map.importers.plain_grids import read_npz, read_text_grid
+        from shared_map.importers import plain_grids
 
-        return in_memory((read_npz if path.suffix.lower() == ".npz" else read_text_grid)(path, what), files)
+        return in_memory(getattr(plain_grids, PLAIN[path.suffix.lower()])(path, what), files)
     name, driver, length = _kind_of(path, what)
     dataset = files.enter_context(rasterio.open(name, driver=driver))
     _check_size(dataset, what)

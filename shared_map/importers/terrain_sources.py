@@ -11,7 +11,7 @@ import msgspec
 import numpy as np
 
 from shared_map.array_files import Bools, Bytes, Floats
-from shared_map.importers.raster_files import DRIVERS_BY_ENDING, PLAIN, is_named, is_raster
+from shared_map.importers.raster_files import DRIVERS_BY_ENDING, PLAIN, Numbers, is_named, is_raster
 from shared_map.terrain.pace_layers import TerrainClass
 from shared_map.terrain.row_bands import Progress, no_progress
 from swarm.config.ground import TerrainConfig
@@ -84,7 +84,7 @@ def load_source(config: TerrainConfig, seed: int, progress: Progress = no_progre
 
         path = Path(config.source)
         check_file(path, FileKind.TEXT_GRID)
-        source = _map(path, config) if is_named(path, _LEVEL) else read_raster(path, config, progress)
+        source = _map(path, config) if is_named(path, _FLAT_MAPS) else read_raster(path, config, progress)
     source = without_voids(source, config)
     if config.photo is not None:
         from shared_map.importers.cover.photos import read_photo
@@ -143,9 +143,9 @@ def _map(path: Path, config: TerrainConfig) -> Source:
     """A map without heights: level, with the pace that the file states."""
     from rasterio.transform import from_origin
 
-    from shared_map.importers.plain_grids import read_map, read_ros
+    from shared_map.importers import plain_grids
 
-    found = read_map(path) if path.suffix.lower() == ".map" else read_ros(path)
+    found: Numbers = getattr(plain_grids, _FLAT_MAPS[path.suffix.lower()])(path)
     side_m = config.resolution_m or 1.0
     place = found.transform or from_origin(0.0, 0.0, side_m, side_m)
     resolution_m = float(place.a)
@@ -160,8 +160,9 @@ def _map(path: Path, config: TerrainConfig) -> Source:
     return Source(grid, level, np.zeros(factor.shape, np.uint8), factor=factor, notes=(str(path), *found.notes))
 
 
-_LEVEL = (".map", ".yaml", ".yml")
-_ENDINGS = (*DRIVERS_BY_ENDING, ".zip", *PLAIN, *_LEVEL)
+_FLAT_MAPS = {".map": "read_map", ".yaml": "read_ros", ".yml": "read_ros"}
+"""Endings of maps without heights -> their reader in `plain_grids`."""
+_ENDINGS = (*DRIVERS_BY_ENDING, ".zip", *PLAIN, *_FLAT_MAPS)
 """Endings of terrains; a raster of any other name is known by how it begins."""
 FILE_KINDS = ", ".join(_ENDINGS)
 
@@ -176,13 +177,13 @@ def is_terrain(path: Path) -> bool:
 
 def without_voids(source: Source, config: TerrainConfig) -> Source:
     """Voids counted, and filled if asked for; nothing is done in silence."""
-    from shared_map.importers.water_and_voids import fill_voids, voids_of
+    from shared_map.importers.water_and_voids import clear_voids, fill_voids
 
     elevation_m = source.elevation_m
     if not elevation_m.flags.writeable:
         elevation_m = elevation_m.copy()
     some_m = elevation_m[::_SOME, ::_SOME].copy()
-    count = voids_of(elevation_m)
+    count = clear_voids(elevation_m)
     if count == 0:
         return replace(source, elevation_m=elevation_m)
     share = count / elevation_m.size

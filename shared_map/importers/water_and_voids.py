@@ -23,6 +23,7 @@ _LEAST_ALIKE, _LEAST_ALIKE_MEANS = 2, 3
 """Number of the eight neighbours that are as high as a cell of a patch: those of a creek one cell wide are two.
 Among means of blocks a chain of equal ones is a contour line."""
 _STEPS = ((0, 1), (1, -1), (1, 0), (1, 1))
+"""(rows down, columns to the right) to four neighbours: each pair of the eight is compared once."""
 _SHORE_CELLS, _UNDER, _OVER, _RIPPLED = 3, 0.25, 0.015, 0.1
 """Foot of a shore that a filter leaves on its water: cells within this distance, higher than it by less than this
 share of the rise there, or lower by less than a quarter, if a tenth of the cells beside a patch is so. Unfiltered
@@ -160,6 +161,8 @@ see, a gentle slope is no lake: its far end is at another height."""
 _COARSE_M = 0.25
 """In whole metres gentle ground is level, too."""
 _LEAST_CELLS_TOLD, _LEAST_CELLS_FINE, _LEAST_CELLS_COARSE = 5, 16, 40
+"""Cells of the smallest level patch: of one that is told although it is no water, and of water where heights have
+fine steps and coarse ones. In coarse steps more ground is level by chance. Chosen, not measured."""
 _MOST_LOWER = 0.25
 """Water has a shore, above it but for an outlet. Level ground beside much lower ground is the top of something, or
 a part of a rounded slope. The next step of a river that is levelled in steps does not count as lower ground."""
@@ -183,6 +186,7 @@ cell it differs by a third of its range there; on gentle ground by a sixth, or a
 _TOLD_SHARE = 0.001
 """The note has one decimal of a percent: a smaller share would be shown as 0.0 or 0.1 %."""
 _MUCH_WATER = 0.05
+"""Share of the terrain from which on many small lakes are doubted: filled sinks. Chosen, not measured."""
 _ROUNDINGS_M, _LEAST_HEIGHTS, _MOSTLY = (1.0, 0.5, 0.25, 0.1), 5, 0.9
 """Usual roundings of heights. They count if 0.9 of all level cells, at five heights or more, lie on one."""
 
@@ -218,7 +222,7 @@ def level_ground(elevation_m: Floats) -> LevelGround:
         Of patches that a rounding of heights does not explain.
     """
     elevation_m = elevation_m.copy()
-    voids_of(elevation_m)
+    clear_voids(elevation_m)
     heights_m, row, col = surveyed(elevation_m)
     mask, patches, level = _at_one_scale(np.ascontiguousarray(heights_m))
     finer = elevation_m.size / heights_m.size
@@ -360,7 +364,7 @@ def _rough_water(elevation_m: Floats, mask: Bools) -> list[tuple[float, int]]:
     return [(float(height_m[n]), int(taken[n])) for n in np.flatnonzero(water).tolist()]
 
 
-def looked_at(
+def examined(
     stored: Floats, config: TerrainConfig, scale: float = 1.0, offset: float = 0.0
 ) -> tuple[tuple[float, ...], Bools, list[str]]:
     """Returns (values that are no heights, bool (rows, cols) of flat cells, notes for people on both).
@@ -370,14 +374,14 @@ def looked_at(
     stored : float32 (rows, cols)
         As in the file; `scale` and `offset` make metres of it.
     """
-    unknown = undeclared_voids(without(stored, config.nodata_values), scale, offset)
+    unknown = undeclared_voids(voids_as_nan(stored, config.nodata_values), scale, offset)
     voids = (*config.nodata_values, *unknown)
     notes = [
         f"{code:g} is taken for no height: nothing else is near it, though the file does not declare it"
         " (terrain.nodata_values says so for good)"
         for code in unknown
     ]
-    found = level_ground(without(stored, voids) * np.float32(scale) + np.float32(offset))
+    found = level_ground(voids_as_nan(stored, voids) * np.float32(scale) + np.float32(offset))
     if found.patches:
         (height_m, cells), many = found.patches[0], len(found.patches)
         taken = f"is taken for {config.level_is}, as terrain.level_is says"
@@ -412,6 +416,7 @@ def _step_m(elevation_m: Floats) -> float:
 HIGHEST_M = 20_000.0
 """Heights beyond this, up or down, are undeclared voids."""
 _SEARCH_CELLS = 64
+"""Distance over which a void is filled from heights around it; farther in it takes the nearest height."""
 CODES = (-32768.0, -32767.0, -99999.0, -9999.0, -9998.0, -999.0, -500.0, 9999.0, 32767.0, 65535.0)
 """Values which programs write for an unknown height."""
 _GAPS_M = {**dict.fromkeys(CODES, 100.0), 0.0: 30.0}
@@ -455,14 +460,14 @@ def undeclared_voids(
     return tuple(code for code in codes if nearest_m[code] >= _GAPS_M[code] and nearest_m[code] > _ALONE * widest_m)
 
 
-def without(heights: Floats, voids: Sequence[float]) -> Floats:
+def voids_as_nan(heights: Floats, voids: Sequence[float]) -> Floats:
     """Heights as stored, with NaN for each value that stands for no height."""
     if not voids:  # as in most files: no copy
         return heights
     return np.where(np.isin(heights, np.array(voids, np.float32)), np.float32(np.nan), heights)
 
 
-def voids_of(elevation_m: Floats) -> int:
+def clear_voids(elevation_m: Floats) -> int:
     """Replaces every value that is no height by NaN, and counts them.
 
     Parameters

@@ -167,8 +167,11 @@ NEEDED = ("ground", "elevation", "classes")
 """Layers that every process needs. The prior pace follows from the ground and the vehicle's radius; the photo is to
 look at."""
 _REGIONS_AT_ONCE = 8
+"""Regions of one request: bounds the size of an answer."""
 _ASK_TIMEOUT_S = 3.0
+"""Time for the answers of all keepers. Chosen, not measured."""
 _PAUSE_S = 0.25
+"""Pause before a request is repeated. Chosen, not measured."""
 _MOST_KEEPERS = 16
 """Further processes that reply for a base map are not queried."""
 

@@ -90,6 +90,7 @@ class Table(NamedTuple):
 
 
 META = Table("meta", {"key": "TEXT", "value": "TEXT"}, 1)
+"""Its key is the first column."""
 
 
 class SealedDatabase:

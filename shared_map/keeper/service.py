@@ -42,6 +42,7 @@ THROTTLED = "throttled."
 _RETRY_NS = NS_PER_S
 """A disk that refused is tried again after this."""
 _NOTE_AGAIN_NS = 60 * NS_PER_S
+"""Interval of repeated notes about a full disk: the log stays readable. Chosen, not measured."""
 _NAME_AT_MOST = 16
 """Authors that are named in gauges and events: each gauge is a line for its collector."""
 _COMPACT_EVERY_NS = NS_PER_S

@@ -27,9 +27,11 @@ ONE = 1 << 16
 MOST = 5 * ONE
 """No |y| is taken for more: a pace e^5 times the prior's. The variance is at most the square of it, 25."""
 MOST_CELLS = (1 << 20) - 1
+"""Cells of one kind of ground that count at most; a number of them stays below _MOST_NUMBER."""
 _SIGN = 1 << 19
 """Added to a mean, so that it is written as a positive number: more than MOST, and far below _MOST_NUMBER."""
 _MOST_NUMBER = (1 << 21) - 1
+"""Largest number that is written as a pace, 1 + number / ONE: float32 holds each exactly."""
 _MOST_VARIANCE = MOST * MOST // ONE
 _BIN = ONE // 64
 """Width of the bins of a trimmed mean, each with the exact sums of its own: memory does not grow with the cells."""

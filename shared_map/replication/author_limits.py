@@ -31,6 +31,7 @@ _OTHERS = ""
 _BURST_S = 10
 """A full bucket lasts so long at its rate: a vehicle that finds a burnt forest may tell of it at once."""
 _FORGET_NS = 60 * NS_PER_S
+"""A process that was silent for this time, and waits for nothing, loses its budget: its bucket is full by then."""
 _SPEAKS_NS = _BURST_S * NS_PER_S
 """An author that was silent for longer has a full bucket, and needs no share."""
 

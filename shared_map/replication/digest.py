@@ -179,6 +179,7 @@ _RETRY_NS = NS_PER_S * 15 // 100
 _MAX_TRIES = 10
 """After these the sender has sent its next whole digest, which starts again."""
 _MAX_SENDERS = 4096
+"""Senders whose order and parts are kept: bounds the memory. Chosen, not measured."""
 _MAX_PARTS = 128
 """Most that wait of one sender: a keeper's digest of every tile of a map of 16,384 x 16,384 cells has 85."""
 _MAX_BYTES = 64 << 20
@@ -188,6 +189,7 @@ _FORGET_NS = 60 * NS_PER_S
 _AT_ONCE = 1024
 """Authors, and every `_ROWS` rows, that are compared in one tick: some 5 ms."""
 _ROWS = 16
+"""Rows of a digest that count as one unit of the work of a tick."""
 
 
 _LAST = (1 << 62, 0)

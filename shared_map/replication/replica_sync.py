@@ -31,7 +31,9 @@ _ENTER = "map-enter"
 _RESYNC = "map-resync:"
 """Tags of queries: all sets, sets of regions that we enter, and sets that a digest showed to be missing."""
 _JOIN_TIMEOUT_S = 5.0
+"""Time for the answers of all replicas to a process that joins. Chosen, not measured."""
 _JOIN_TRIES = 5
+"""Questions before a process begins with what it has: the others may start with it, or there are none."""
 _JOIN_RETRY_NS = NS_PER_S // 2
 """After the first try, and twice as long after each: 7.5 s in all, in which the others of a swarm have started."""
 _ASK_AGAIN_NS = NS_PER_S * 15 // 100

@@ -25,6 +25,7 @@ from swarm.errors import TerrainError
 from swarm.grid import GridSpec
 
 _GRADES = 0.1, 0.5
+"""Least and greatest grade of a surface. Chosen, not measured."""
 _GRADE_OF_RELIEF = 1.8
 """Share of the relief over the shorter side: steep terrain needs a steep surface, over gentle terrain it only
 costs."""

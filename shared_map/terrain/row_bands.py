@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from shared_map.array_files import Bools, Floats, reuse_memory
 
 BAND_ROWS = 128
+"""Rows that are worked on at once: bounds the memory beside the arrays themselves. Chosen, not measured."""
 Progress = Callable[[str, float], None]
 """Called with the current step, and the share of it that is done, 0 to 1."""
 

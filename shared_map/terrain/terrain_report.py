@@ -15,9 +15,14 @@ from swarm.places import bounds_of, extent_of
 _MOST_SIDE = 2048
 """Slopes and parts of larger terrains are taken from every second, third, ... cell."""
 _MUCH_LETHAL, _SCATTERED = 0.5, 0.8
+"""Share of lethal cells above which, and of the largest connected part below which, a terrain is doubted. Chosen,
+not measured."""
 _STEEP_DEG = 60.0
+"""Median slope above which units are doubted: no landscape is so steep."""
 _DOUBT = "! "
 _SEA_FLOOR_M, _MUCH_FLOOR = -0.5, 0.01
+"""Height below which ground lies below the sea, and share of the border above which it may be a sea floor. Chosen,
+not measured."""
 _LOWEST_LAND_M = -450.0
 """The shore of the Dead Sea is at -430 m."""
 

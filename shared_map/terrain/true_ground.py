@@ -20,6 +20,7 @@ from swarm.grid import STEP_COL, STEP_ROW
 from swarm.wire.messages.map_data import PACE_LEAST, PACE_MOST
 
 RUBBLE_FACTOR = np.float32(3.0)
+"""True pace over the map's, as `rubble_fields` of a scenario says."""
 CONNECTED_SHARE = 0.85
 """At least this share of the largest passable part stays passable and connected, besides flooded cells."""
 

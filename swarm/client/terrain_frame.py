@@ -59,9 +59,10 @@ class Frame:
                 grid.west_m + grid.cols * grid.resolution_m,
                 grid.north_m - grid.rows * grid.resolution_m,
             )
+            crs = self.crs if len(self.crs) <= 40 else f"{self.crs[:40]}..."
             raise ConfigError(
                 f"x_m {x_m:.10g}, y_m {y_m:.10g} is outside the terrain, which has x_m {grid.west_m:.10g} ... "
-                f"{east_m:.10g} and y_m {south_m:.10g} ... {grid.north_m:.10g} in {self.crs[:40]}{'...' * (len(self.crs) > 40)}"
+                f"{east_m:.10g} and y_m {south_m:.10g} ... {grid.north_m:.10g} in {crs}"
             )
         return grid.cell(row, col)
 

@@ -55,6 +55,7 @@ class OwnTime:
 _FIRST_ANSWERS_NS = 3 * NS_PER_S // 10
 """A new generation waits this time for the others' answers before it begins. What comes later counts as well."""
 _LATE_ANSWERS_S = 10.0
+"""Time within which answers after the first wait still count. Chosen, not measured."""
 _ASK_AGAIN_NS = NS_PER_S
 _ASK_RARELY_NS = 30 * NS_PER_S
 """Interval of recovery queries to agents: a second, then twice as long each time, up to this."""
@@ -67,6 +68,7 @@ _MOST_DIGITS = 9
 _RESERVE_NS = NS_PER_S
 """Space for promises is looked for at this interval: a check costs a system call."""
 _SILENT_AGAIN_NS = 60 * NS_PER_S
+"""Interval of repeated events about silent agents and slow links: the log stays readable. Chosen, not measured."""
 _SLOW_FOR_NS = 5 * NS_PER_S
 """A link is reported once it has been slow for this time: at a start all are, for a moment."""
 _WAITING_AGAIN_NS = 30 * NS_PER_S

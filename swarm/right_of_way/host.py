@@ -32,16 +32,17 @@ class Host(Holdings):
     def __init__(self, shards: Shards, name: str, vehicles: Collection[str] | None) -> None:
         super().__init__(shards, name, vehicles)
         self._known_generation = 0
-        self._told_by: set[str] = set()
+        self._informants: set[str] = set()
         """Agents that have sent us their knowledge of us."""
         self._twins = Roster()
+        """Other processes of this host, as a second start of it: of these one generation counts."""
         self._alone_since_ns: int | None = None
         self._led_ns: dict[int, int] = {}
         """Shard that concerns us -> when its leader was heard last."""
 
     def hear_known(self, known: Known) -> None:
         """An agent has tables that name this generation of ours, and shards which concern us."""
-        self._told_by.add(known.agent)
+        self._informants.add(known.agent)
         if not is_far_ahead(known.generation, self._known_generation):
             self._known_generation = max(self._known_generation, known.generation)
         self.watch(known.shards)
@@ -50,11 +51,11 @@ class Host(Holdings):
     def informed(self) -> bool:
         """True if we know every shard in which cells are granted to us: of each shard enough members have replied
         that one of them has the newest usable table."""
-        if self._told_by.issuperset(self.shards.agents):
+        if self._informants.issuperset(self.shards.agents):
             return True
         every = map(self.shards.members, self.shards.all)
         enough = self.shards.liars - self.shards.majority
-        return all(len(self._told_by.intersection(of)) > len(of) + enough for of in every)
+        return all(len(self._informants.intersection(of)) > len(of) + enough for of in every)
 
     def begin(self, dead: Sequence[int], chance: int) -> list[int]:
         """Begins a new generation, once those who could be asked have answered. Returns the generations to keep
@@ -88,7 +89,7 @@ class Host(Holdings):
         if now_ns - self._alone_since_ns < _ALONE_NS:
             return False
         self._alone_since_ns = None
-        self._told_by.clear()  # the successor may have driven into other shards
+        self._informants.clear()  # the successor may have driven into other shards
         self._known_generation = max(self._known_generation, self.newest)
         self.end()
         return True

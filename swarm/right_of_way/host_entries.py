@@ -35,6 +35,7 @@ _MOST_DISCLAIMED = 1 << 8
 """Entries of a shard that one member may ask for: more than tables that lost can have granted to a host, and a liar
 fills no other member's share."""
 BEFORE_ALL: Stamp = (0, 0)
+"""Stamp of no table: none compares less."""
 
 
 @dataclass(slots=True)

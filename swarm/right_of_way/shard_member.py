@@ -20,10 +20,14 @@ LEASE_NS = 3 * HEARTBEAT_NS
 """A leader that is silent for this time may be replaced, later if answers take long. Until then its members refuse
 every claim (docs/design/right-of-way.md)."""
 _RANK_NS = NS_PER_S // 5
+"""Time between the claims of two members on a fast link. Chosen, not measured."""
 _START_NS = 3 * NS_PER_S // 10
+"""Time on a fast link before a member claims a shard that was led before: its leader may still speak. Chosen, not
+measured."""
 _WANTED_NS = NS_PER_S
 """Time without a host's message after which no leader is needed."""
 _TICK_NS = NS_PER_S // 10
+"""Tick of an agent at the usual `vehicles.tick_hz`."""
 _UNKNOWN_NS = NS_PER_S
 """Assumed before the first answer: a claim that comes too late costs once, one that comes too early each time."""
 _LONGEST_NS = 4 * NS_PER_S

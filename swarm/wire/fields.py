@@ -164,6 +164,7 @@ VehicleId = Id
 Word = Annotated[str, Meta(max_length=100)]
 """A name, of a counter or a strategy, or what kind of note it is."""
 MOST_TEXT = 2000
+"""Characters. Chosen, not measured."""
 Text = Annotated[str, Meta(max_length=MOST_TEXT)]
 """Sentences for people."""
 LongText = Annotated[str, Meta(max_length=1 << 16)]

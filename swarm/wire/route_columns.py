@@ -240,7 +240,9 @@ class RouteBatch:
 
 
 _LEAST_CELL, _MOST_CELL = -(1 << 31), (1 << 32) - 1
+"""A start is what its asker named, which may lie outside of the grid."""
 _MOST_STEPS = 4 << 20
+"""Steps of one route: above all that planners give (`planner_service.planner.MOST_STEPS`)."""
 _ONE, _WIDTHS = Struct("<qI4d"), (8, 4, 8, 8, 8, 8)
 """One value of each column of numbers, and their bytes."""
 _Numbers = Annotated[bytes, Column("<f8", per="statuses", least=0, most=math.inf)]
@@ -405,6 +407,7 @@ def _codes() -> NDArray[np.uint8]:
 
 
 _DIGITS = bytes(range(ord("0"), ord("8"))) + bytes(248)
+"""Translates direction codes to the digits of JSON; `_CODES` back."""
 _CODES = bytes((digit - ord("0")) % 256 for digit in range(256))
 
 

@@ -161,7 +161,9 @@ class Follower:
 
 
 _RETRY_NS = NS_PER_S // 5
+"""First interval between two requests of a vehicle that needs a route. Chosen, not measured."""
 _LONGEST_RETRY_NS = 3 * NS_PER_S
+"""It doubles up to this one. Chosen, not measured."""
 STRANDED_RETRY_NS = 3 * NS_PER_S
 """Vehicles without a path ask again so soon: only a changed map gives them one."""
 PREFETCH_CELLS = 8

@@ -28,6 +28,7 @@ begins after SINCE_M of its step. It rolls up to UNTIL_M, at FACTOR times the pa
 The share COUNTS of the seconds that it drives is added to DRIVEN_S; that is NaN of a step which is not measured."""
 (DONE_M, UNTIL_M, BY, FACTOR, COUNTS, CELL, HEADING_RAD, ROW, COL, TO_ROW, TO_COL, SINCE_M, LENGTH_M) = range(13)
 DRIVEN_S = 13
+"""Column behind those above, which a new step leaves as it is."""
 _COLUMNS = 14
 
 

@@ -30,6 +30,7 @@ _AGAIN_NS = NS_PER_S
 _RARELY_NS = 16 * NS_PER_S
 """A vehicle without a path around is tried again after one second, then after twice as long, up to this."""
 _DIAGONAL = math.sqrt(2.0)
+"""Length of a diagonal step, in cells."""
 
 
 @dataclass

@@ -30,6 +30,7 @@ _SHORTEST_CUT = 0.5
 know better than hosts what steps cost, so it is less than for the next; but more than for the next with a vehicle
 on it."""
 _DIAGONAL = math.sqrt(2.0) - 1.0
+"""Length of a diagonal step over that of a straight one, in cells."""
 _OCCUPIED = 0.9
 """Cost of pushing another vehicle, in cells: less than a step, so that a vehicle without another path pushes."""
 _LEAST_GAIN = 0.01

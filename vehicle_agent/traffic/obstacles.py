@@ -127,6 +127,7 @@ MAKE_WAY_S = 2.0
 STANDS_NS = NS_PER_S
 """An obstacle that has kept its place for this time is driven around, not waited for."""
 MOST_OBSTACLES = 256
+"""Ids that may report: bounds the time of a tick. Chosen, not measured."""
 MOST_CELLS = 100_000
 """Limit for all obstacles together: bounds time and memory, and the effect of false reports."""
 MOST_CELLS_OF_ONE = MOST_CELLS // 2
@@ -136,6 +137,8 @@ _FURTHEST_CELLS = 64
 _LONGEST_PAUSE_NS = NS_PER_S // 4
 """Time between two ticks that counts for leases. A process that was stopped has not listened meanwhile."""
 _DEAF_NS = NS_PER_S // 2
+"""A pause between two ticks after which reports may have been lost: all obstacles are awaited again. Chosen, not
+measured."""
 LISTEN_NS = NS_PER_S
 """Each obstacle is published at least this often, so that a new subscriber knows it."""
 _GHOSTS = 3
@@ -143,6 +146,7 @@ _GHOSTS = 3
 _MOST_SENDERS = 4
 """Lives of one id, of which each may still be there: one that starts again, a second program by mistake."""
 _MOST_TOLD = 1000
+"""Complaints that are remembered, so that each is told once: bounds the memory. Chosen, not measured."""
 _LEAP_M = 5.0
 """Distance beyond the one its speed explains: the error of satellite positions."""
 

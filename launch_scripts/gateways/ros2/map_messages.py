@@ -49,7 +49,7 @@ _WHOLE_NS, _CELLS_AT_ONCE = 10 * NS_PER_S, 1 << 20
 more cells than a million."""
 Cells = NDArray[np.int64]
 _DELETE_ALL = 3
-_HAIR = 0.15
+_LINE_CELLS = 0.15
 """Width of lines, in sides of a cell."""
 
 
@@ -93,7 +93,7 @@ def occupancy_grid(messages: RosMessages, stamp_ns: int, occupancy: Occupancy, s
         "width": cols, "height": rows, "origin": messages.pose(west_m, south_m - beyond_m),
     }  # fmt: skip
     return messages.types.make(
-        "nav_msgs/msg/OccupancyGrid", header=messages.header(stamp_ns), info=info, data=_flat(occupancy)
+        "nav_msgs/msg/OccupancyGrid", header=messages.header(stamp_ns), info=info, data=_from_south(occupancy)
     )
 
 
@@ -105,11 +105,11 @@ def occupancy_update(messages: RosMessages, stamp_ns: int, occupancy: Occupancy,
     theirs = flipped(window, messages.map.grid.rows)
     return messages.types.make(
         "map_msgs/msg/OccupancyGridUpdate", header=messages.header(stamp_ns), x=theirs.col0, y=theirs.row0,
-        width=theirs.col1 - theirs.col0, height=theirs.row1 - theirs.row0, data=_flat(occupancy),
+        width=theirs.col1 - theirs.col0, height=theirs.row1 - theirs.row0, data=_from_south(occupancy),
     )  # fmt: skip
 
 
-def _flat(occupancy: Occupancy) -> NDArray[np.int8]:
+def _from_south(occupancy: Occupancy) -> NDArray[np.int8]:
     return np.ascontiguousarray(occupancy[::-1]).reshape(-1)
 
 
@@ -131,9 +131,9 @@ class MapFeed:
         self._replica = MapReplica(grid, self._map)
         passable = self._map.pace_s_per_m[np.isfinite(self._map.pace_s_per_m)]
         self._best_s_per_m = float(passable.min()) if len(passable) else QUICK_S_PER_M
-        self._told_ns: int | None = None
+        self._published_ns: int | None = None
         self._changed = False
-        """Changes since the whole map was published last, at `_told_ns`."""
+        """Changes since the whole map was published last, at `_published_ns`."""
         self._marks: tuple[Cells, Cells] | None = None
         """Cells that are lethal by marks, and those with a pace by marks; None since the map has changed."""
         self._now_ns = 0
@@ -157,9 +157,9 @@ class MapFeed:
 
         now_ns  by a clock that never leaps
         """
-        due = self._told_ns is None or (self._changed and now_ns - self._told_ns >= self._whole_ns)
+        due = self._published_ns is None or (self._changed and now_ns - self._published_ns >= self._whole_ns)
         if due:
-            self._told_ns, self._changed = now_ns, False
+            self._published_ns, self._changed = now_ns, False
         return due
 
     def occupancy(self, window: Window) -> Occupancy:
@@ -240,7 +240,7 @@ def marker_array(messages: RosMessages, stamp_ns: int, drawings: Iterable[Drawin
 
 def route(grid: GridSpec, points_m: Points, colour: Colour = ROUTE) -> Drawing:
     """The way of a vehicle: float64 (n, 2), x, y."""
-    return Drawing("routes", Form.LINE, points_m, colour, _HAIR * grid.resolution_m)
+    return Drawing("routes", Form.LINE, points_m, colour, _LINE_CELLS * grid.resolution_m)
 
 
 def marked_cells(
@@ -263,7 +263,7 @@ def windows(grid: GridSpec, windows: Iterable[Window]) -> Drawing:
         north, south = (grid.north_m - row * grid.resolution_m for row in (each.row0, each.row1))
         corners = np.array([(west, north), (east, north), (east, south), (west, south)], np.float64)
         sides.append(np.stack([corners, np.roll(corners, -1, axis=0)], axis=1).reshape(-1, 2))
-    return Drawing("windows", Form.LINES, np.concatenate(sides), WINDOW, _HAIR * grid.resolution_m)
+    return Drawing("windows", Form.LINES, np.concatenate(sides), WINDOW, _LINE_CELLS * grid.resolution_m)
 
 
 def corners(points_m: Points) -> Points:

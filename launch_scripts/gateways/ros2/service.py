@@ -29,7 +29,9 @@ from swarm.errors import ConfigError
 log = logging.getLogger(__name__)
 
 TICK_S = 0.02
+"""Pause between two turns: a message waits for so long at most. Chosen, not measured."""
 _AGAIN_S = 2.0
+"""Pause between two attempts to connect. Chosen, not measured."""
 _MOST_SEEN = 4096
 """Peers' endpoints that wait to be looked at; the oldest are dropped first."""
 _POSITIONS_S = 0.1

@@ -42,6 +42,7 @@ LEVEL_GRADE, SHORE_GRADE = 0.05, 0.15
 STILL_GRADE = 0.004
 """A lake's own cells in a height model are level to some millimetres a metre."""
 LIKELY, CERTAIN, STILL = np.uint8(1), np.uint8(2), np.uint8(4)
+"""Signs of water, as bits of one byte."""
 EXPOSURES = ((1.1, 1.03), (0.9, 0.97))
 """(gain, red over green): two photos of one place differ by as much, and more."""
 LEVEL_SAND = 0.1
@@ -207,8 +208,11 @@ COARSEST_M = 30.0
 REACH = 8
 """Rows and columns around a cell that its strength looks at."""
 _DIRECTIONS = 8
+"""Directions of a line that are tried: half a turn in steps of 22.5 degrees."""
 _SIDE = 2.0
+"""Cells from the middle of a line to the ground beside it, with which it is compared."""
 _TAPS = (-4, -2, 0, 2, 4)
+"""Cells along a line at which its contrast is taken: all within `REACH`."""
 _MARGIN = 6
 """Margin for side and tap together."""
 _BRIGHTEST = 40
@@ -216,6 +220,7 @@ _BRIGHTEST = 40
 _FIXED = 8
 """Parts of a grey level while strengths are summed in 16 bits, which is twice as fast as in floats."""
 _STRONG = 60
+"""Strength from which on a cell is part of a road by itself. Chosen, not measured."""
 _SHORTEST = 25
 """Cells; specks, roofs and field boundaries are shorter."""
 
@@ -300,6 +305,7 @@ LEVEL_M, LEVEL_PER_CELL = 0.25, 0.025
 """Standard deviation of a lake's heights: metres of the survey, and per metre of cell for the bank in a cell at the
 shore. Lakes that were measured have at most nine tenths of it; the shadow of a cloud lies over more."""
 SMALLEST_LAKE = 12
+"""Cells. Chosen, not measured."""
 SHORE = (2, 2, 2)
 """Around lakes, as `spread` takes it: a beach is a bright line, too."""
 ROAD_GRADE = np.float32(0.5)

@@ -33,7 +33,9 @@ from swarm.errors import TerrainError
 from swarm.grid import GridSpec
 
 HIGHEST_CODE = 65_533
+"""Largest code of 16 bits but for the two numbers of larger codes and of none (`_LARGER`, `_NOTHING`)."""
 _SHOWN = 8
+"""Codes that a sentence lists at most. Chosen, not measured."""
 
 
 @dataclass(frozen=True)

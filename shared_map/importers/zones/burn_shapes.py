@@ -30,12 +30,15 @@ Floats64 = NDArray[np.float64]
 MOST_FEATURES, MOST_CORNERS = 500_000, 20_000_000
 """Limits of one layer on the terrain."""
 _MOST_CROSSINGS = 50_000
+"""Crossings of a shape with itself: a repair takes time by their number. Chosen, not measured."""
 _STEP_M = 1000.0
 """Longer edges are cut: a straight edge in one system is bent in another, by some centimetres over this length."""
 _DEG_M = 111_000.0
+"""Metres of a degree of latitude, to a hundredth."""
 _LINE, POLYGON = 1, 3
 """Numbers of a line and of a polygon among the types of shapely."""
 _MOST_BURNT_CELLS = 1 << 34
+"""Cells of all boxes around shapes: 64 times the largest grid. Bounds the time. Chosen, not measured."""
 _HEAVY = 50_000_000
 """Corners times rows of a polygon: GDAL looks at every corner in every row."""
 _CHUNK = 4096

@@ -41,6 +41,7 @@ _TOGETHER = {"LIBKML": None, "GPX": {"waypoints", "routes", "tracks"}, "OSM": {"
 """Formats whose layers are one drawing, and the layers which hold it; None: all."""
 _IDS = ("id", "@id", "osm_id", "osm_way_id", "full_id")
 _POLYGONS = 3
+"""shapely's number of a polygon: those of collections are higher."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -332,6 +333,7 @@ _document = msgspec.json.Decoder(_Document)
 _feature = msgspec.json.Decoder(Feature | Geometry)
 _lines = msgspec.json.Decoder(msgspec.Raw)
 _LOOKED_AT = 4096
+"""Bytes in which the beginning of another format is looked for."""
 _RECORD = b"\x1e"
 """The sign before each feature of a GeoJSON text sequence."""
 
@@ -536,6 +538,7 @@ def fence_of_waypoints(text: str) -> list[dict[str, Any]]:
 
 
 _LAST_NAV = 95
+"""MAVLink's commands up to this one (MAV_CMD_NAV_LAST) are places on a route."""
 _POLYGON_IN, _POLYGON_OUT, _CIRCLE_IN, _CIRCLE_OUT = 5001, 5002, 5003, 5004
 """MAVLink's commands of fences; those of routes are below."""
 

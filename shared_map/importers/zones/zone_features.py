@@ -132,6 +132,7 @@ _WIDEST_M = 1000.0
 """Lines that run so far outside the terrain are of no use to it."""
 Corner = tuple[float, float]
 MOST_OUTLINES = 50
+"""Areas of one order, each of which is a zone of its own. Chosen, not measured."""
 _LEAST_HALF = 0.71
 """Half the least width of a line or a point in cells: the middle of each cell that it crosses is within it, and an
 order closes a cell by its middle."""

@@ -59,6 +59,7 @@ def is_vector(path: Path) -> bool:
 
 
 _NAMED = 5
+"""Features that a note names at most. Chosen, not measured."""
 LEAST, MOST = 1e-6, 1e6
 """Factors and paces that a file may say."""
 

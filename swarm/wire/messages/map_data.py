@@ -266,6 +266,7 @@ class MarksRequest(Message, frozen=True, kw_only=True, tag=schema_of("marks-requ
 
 
 BASE_DIGEST_BYTES = 8
+"""Bytes of the digest of one region of a layer."""
 MOST_REGIONS = 1 << 16
 """Number of regions of the largest grid."""
 _DIGESTS = Meta(max_length=BASE_DIGEST_BYTES * MOST_REGIONS)

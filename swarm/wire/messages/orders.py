@@ -16,6 +16,7 @@ from swarm.wire.messages.map_data import PACE_LEAST, PACE_MOST, DigestRows
 MOST_CORNERS = 256
 """Corners of a zone's polygon."""
 MOST_ZONES = 1000
+"""Zones of a run at most; a scenario has the same limit."""
 ZoneName = Annotated[str, Meta(max_length=40)]
 """Empty where none is given."""
 _ZONE_NAME = re.compile(r"[A-Za-z0-9_-]{1,40}")

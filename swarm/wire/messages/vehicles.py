@@ -150,7 +150,9 @@ class Followed(Message, frozen=True, kw_only=True, tag=schema_of("followed")):
 
 
 LONGEST_OBSTACLE_LEASE_S = 10.0
+"""Bound on the time for which one report closes cells. Chosen, not measured."""
 MOST_RADIUS_M = 100.0
+"""Bound on the ground that one report closes. Chosen, not measured."""
 MOST_M_PER_S = 340.0
 """Anything faster than sound is no vehicle, as for marks. A receiver of a faster obstacle reports it and goes
 on."""

@@ -3,11 +3,9 @@
 import importlib
 import sys
 from pathlib import Path
-from types import ModuleType
 
 import pytest
 
-FOLDER = Path(__file__).parents[3] / ".ci"
 BUDGET = """
 [product]
 lines = 9
@@ -27,10 +25,12 @@ TABLE = "| one | two |\n|---|:-:|\n| three - 4 | a|b |\n"
 @pytest.mark.parametrize(
     ("check", "name", "text", "fault"),
     [
-        ("house", "swarm/bus/long.py", "a = 1\nb = 2\nc = 3\n", "swarm/bus: 3 lines, of which"),
+        ("house", "swarm/bus/long.py", "a = 1\nb = 2\n", "swarm/bus: 3 lines, of which"),
         ("house", "swarm/lost.py", "a = 1\n", "swarm/lost.py: no row of budget.toml covers it"),
         ("house", "launch_scripts/ears.py", "bus.subscribe(TOPIC)\n", "launch_scripts/ears.py: subscribes"),
         ("house", "swarm/bus/load.py", 'open("/proc/stat")\n', "swarm/bus/load.py: reads /proc"),
+        ("house", "swarm/bus/ear.py", "a = 1\n", "swarm/bus/ear.py: shorter than 60 lines, and only one.py"),
+        ("house", "swarm/bus/far/one.py", "a = 1\n", "one.py occurs 2 times: swarm/bus/far/one.py"),
         ("house", "pages/table.md", TABLE, ""),
         ("house", "pages/long.md", TABLE + "\nseven", "pages: 7 words, of which budget.toml allows 6"),
         ("words", "swarm/ask.py", '"""Whether it ends."""\n', 'swarm/ask.py:1: a docstring begins with "Whether"'),
@@ -45,13 +45,13 @@ def test_a_fault_is_named_and_all_else_is_in_order(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str],
     check: str, name: str, text: str, fault: str,
 ) -> None:  # fmt: skip
-    monkeypatch.syspath_prepend(FOLDER)
-    module: ModuleType = importlib.import_module(check)
+    monkeypatch.syspath_prepend(Path(__file__).parents[3] / ".ci")
+    module = importlib.import_module(check)
     for each in {module, importlib.import_module("house")}:
         monkeypatch.setattr(each, "ROOT", tmp_path)
     monkeypatch.setattr(sys, "argv", [f"{check}.py"])
-    (tmp_path / "budget.toml").write_text(BUDGET)
-    (tmp_path / name).parent.mkdir(parents=True)
-    (tmp_path / name).write_text(text)
+    for path, written in (("budget.toml", BUDGET), ("swarm/bus/one.py", "import swarm.bus.ear\n"), (name, text)):
+        (tmp_path / path).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / path).write_text(written)
     assert module.main() == bool(fault)
     assert fault in capsys.readouterr().err
