@@ -45,7 +45,7 @@ from shared_map.vehicle_class_grounds import prepare_classes
 from swarm.bus.bus import Bus
 from swarm.bus.endpoints import listening
 from swarm.bus.zenoh_bus import open_bus
-from swarm.clock import MonotonicClock
+from swarm.clock import MonotonicClock, date_ns
 from swarm.config.scenario import UNTIL_STOPPED_S
 from swarm.errors import BusError, StoreError, SwarmError
 from swarm.peers import Peer, job_of
@@ -175,7 +175,7 @@ class _Run:
             return self._stopped_early()
         log.info("kernels are loaded")
         failures: list[str] = []
-        self._started_ns = self._started_ns or time.time_ns()
+        self._started_ns = self._started_ns or date_ns()
         try:
             if not self._options.joins and "router" in self._options.roles:
                 self._swarm.start("router")

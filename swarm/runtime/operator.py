@@ -17,6 +17,7 @@ import msgspec
 from msgspec.structs import replace
 
 from swarm.bus.bus import Appeared, AskEnded, Bus, Disappeared, Event, Replied
+from swarm.clock import date_ns
 from swarm.config.agent_plan import agent_of
 from swarm.errors import BusError, ConfigError
 from swarm.peers import Roster, job_of
@@ -173,7 +174,7 @@ class Operator:
     def _order(self, topic: Topic, order: AnyOrder, kind: type[M], members: list[RunInfo] | None = None) -> M:
         """The answer of a keeper to an order."""
         keeper = self._keeper(members)
-        stamped = replace(order, stamp_ns=time.time_ns())
+        stamped = replace(order, stamp_ns=date_ns())
         replies, failure = replies_to(self._bus, topic, stamped, _ORDER_S, keeper=keeper)
         if replies:
             assert isinstance(replies[0], kind)
