@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import operator
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -18,7 +17,7 @@ from planner_service.tree.cost_grid import CostGrid
 from shared_map.terrain.step_climb import Climb
 from swarm.config.explain import choice, converted
 from swarm.config.scenario import PlannerConfig
-from swarm.grid import GridSpec, Window, walk
+from swarm.grid import GridSpec, Window, walk, whole
 from swarm.wire.route_columns import Route, RouteStatus, TargetStatus, directions_of
 
 _KEPT_BYTES = 1 << 28
@@ -229,7 +228,7 @@ class RouteFinder:
 def _whole(place: Any) -> tuple[int, int]:
     """A place as a cell. Raises TypeError if row or column is not whole: half a row may be half a map away."""
     try:
-        row, col = map(operator.index, place)
+        row, col = map(whole, place)
     except (TypeError, ValueError) as error:
         raise TypeError(f"{place!r} is no cell, which is two whole numbers, such as 1, 1") from error
     return row, col

@@ -7,10 +7,12 @@ x grows to the east, y to the north; `west_m` and `north_m` are the outer corner
 from __future__ import annotations
 
 import math
+import operator
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import accumulate
+from typing import Any
 
 from swarm.errors import OutsideGridError
 
@@ -27,6 +29,15 @@ MOST_SHARDS = 1 << 21
 
 MAX_CELLS = 16384 * 16384
 """A larger grid is refused wherever one comes from outside."""
+
+
+def whole(value: Any) -> int:
+    """A whole number, also of NumPy's. Raises TypeError on anything else, such as 2.0, and on True, which Python
+    takes for 1."""
+    if isinstance(value, bool):
+        raise TypeError(f"{value} is no whole number")
+    return operator.index(value)
+
 
 STEP_ROW = (-1, -1, 0, 1, 1, 1, 0, -1)
 STEP_COL = (0, 1, 1, 1, 0, -1, -1, -1)

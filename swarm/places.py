@@ -12,7 +12,8 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
+from numbers import Real
 from typing import Any, Literal, NamedTuple, Protocol
 
 from swarm.errors import ConfigError
@@ -82,7 +83,10 @@ def read_place(given: Given, what: str) -> Place:
     if isinstance(given, Place):
         return given
     if not isinstance(given, str):
-        row, col = given[0], given[1]
+        numbers = list(given) if isinstance(given, Iterable) else []
+        if len(numbers) != 2 or not all(map(_is_number, numbers)):
+            raise ConfigError(f"{what} is {str(given)[:60]}; expected {FORMS}, or a row and a column")
+        row, col = numbers
         return Place(f"[{row}, {col}]", "cell", row, col, row == int(row) and col == int(col))
     match = _PLACE.fullmatch(given.strip())
     if match is None:
@@ -96,6 +100,11 @@ def read_place(given: Given, what: str) -> Place:
     if kind == "latlon" and not _is_degrees(place):
         raise ConfigError(f"{what} is {_shown(place)}: no latitude (-90 to 90) and longitude (-360 to 360)")
     return place
+
+
+def _is_number(value: Any) -> bool:
+    """Returns True for a finite number, also of NumPy's; True and False are none."""
+    return not isinstance(value, bool) and isinstance(value, Real) and math.isfinite(value)
 
 
 def cell_of(given: Given, frame: Frame, what: str) -> int:

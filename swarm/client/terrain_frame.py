@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import contextlib
 import math
-import operator
 import reprlib
 from collections.abc import Callable, Iterable
 from functools import cached_property
 from typing import Any
 
 from swarm.errors import ConfigError, missing
-from swarm.grid import GridSpec
+from swarm.grid import GridSpec, whole
 from swarm.places import Given, cell_of, written
 from swarm.wire.messages.processes import RunInfo
 
@@ -137,7 +136,7 @@ def checked_cells(frame: Frame, cells: Iterable[int]) -> list[int]:
     once: dict[int, None] = {}
     for each in cells:
         try:
-            cell = operator.index(None if _is_truth(each) else each)  # type: ignore[arg-type]  # of NumPy's, too
+            cell = whole(each)
         except TypeError:
             raise ConfigError(f"cell {reprlib.repr(each)} is no whole number") from None
         if not 0 <= cell < frame.grid.cells:
@@ -148,12 +147,7 @@ def checked_cells(frame: Frame, cells: Iterable[int]) -> list[int]:
 
 def number(name: str, value: Any) -> float:
     """Converts a program's number to a float. Raises ConfigError on anything else, such as text or truth."""
-    if not isinstance(value, str | bytes) and not _is_truth(value):
+    if not isinstance(value, str | bytes | bool) and str(getattr(value, "dtype", "")) != "bool":
         with contextlib.suppress(TypeError, ValueError, OverflowError):
             return float(value)
     raise ConfigError(f"{name} is {reprlib.repr(value)}, expected a number")
-
-
-def _is_truth(value: Any) -> bool:
-    """Returns True for True and False, also those of NumPy, which Python takes for 1 and 0."""
-    return type(value).__name__ in ("bool", "bool_")

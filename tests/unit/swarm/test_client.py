@@ -128,6 +128,9 @@ def test_what_is_no_cell_is_refused_by_every_call_that_takes_one(world: Swarm, w
     ):
         with pytest.raises(ConfigError, match=r"^cell .*(no whole number|outside the terrain)"):
             call()
+    with pytest.raises(ConfigError):
+        program.frame.cell_named((wrong, 3))
+    assert program.frame.cell_named((np.int16(1), 2.0)) == GRID.cell(1, 2)  # type: ignore[arg-type]
     assert program.frame.centre_m(np.int16(7)) == program.frame.centre_m(7)  # type: ignore[arg-type]
 
 
