@@ -610,8 +610,7 @@ class TargetTree:
 
     def _without_path(self, starts: NDArray[np.int64]) -> NDArray[np.int64]:
         """Those of some padded cells from which the tree leads nowhere, or not yet."""
-        without: NDArray[np.int64] = starts[~self._leads(starts)]
-        return without
+        return starts[~self._leads(starts)]
 
     def _open(self, cells: Any) -> NDArray[np.int64]:
         """Those of some numbers that are passable cells of the grid, padded."""

@@ -7,6 +7,7 @@ import math
 import reprlib
 from collections.abc import Callable, Iterable
 from functools import cached_property
+from textwrap import shorten
 from typing import Any
 
 from swarm.errors import ConfigError, missing
@@ -54,11 +55,9 @@ class Frame:
         row = math.floor((grid.north_m - y_m) / grid.resolution_m)
         col = math.floor((x_m - grid.west_m) / grid.resolution_m)
         if not grid.inside(row, col):
-            east_m, south_m = (
-                grid.west_m + grid.cols * grid.resolution_m,
-                grid.north_m - grid.rows * grid.resolution_m,
-            )
-            crs = self.crs if len(self.crs) <= 40 else f"{self.crs[:40]}..."
+            east_m = grid.west_m + grid.cols * grid.resolution_m
+            south_m = grid.north_m - grid.rows * grid.resolution_m
+            crs = shorten(self.crs, 40, placeholder=" ...")
             raise ConfigError(
                 f"x_m {x_m:.10g}, y_m {y_m:.10g} is outside the terrain, which has x_m {grid.west_m:.10g} ... "
                 f"{east_m:.10g} and y_m {south_m:.10g} ... {grid.north_m:.10g} in {crs}"

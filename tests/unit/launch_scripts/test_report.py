@@ -93,6 +93,18 @@ def test_a_target_at_the_upper_border_has_its_name_below_it_also_without_marks(l
     assert axes.texts[0].get_verticalalignment() == "top"
 
 
+def test_the_legend_of_the_map_names_targets_which_no_tracker_published(left: tuple[Path, Recorder]) -> None:
+    tracks = read_tracks(left[0] / "tracks.npz")
+    report = json.loads((left[0] / "report.json").read_text())
+    drawn = {track.id for track in tracks.targets}
+    assert drawn < set(report["by_target"]) == {"t0", "t1"}
+    axes = Figure().add_subplot()
+    picture.draw_map(axes, tracks, report)
+    hidden = ", ".join(sorted(set(report["by_target"]) - drawn))
+    assert picture.untracked(tracks, report) == f" (not drawn, no tracker: {hidden})"
+    assert ("target" in " ".join(axes.get_legend_handles_labels()[1])) == bool(drawn)
+
+
 def test_a_run_of_which_nothing_was_heard_still_leaves_a_report(tmp_path: Path) -> None:
     terrain = terrain_of_pace(np.ones((1, 1), np.float32))
     recorder = Recorder(fake_run.little_scenario(), GridSpec(1, 1, 10.0))
