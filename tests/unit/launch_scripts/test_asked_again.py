@@ -1,6 +1,7 @@
 """A question about places while the process that answers is replaced: it is asked again."""
 
 from concurrent.futures import Future
+from functools import partial
 from types import SimpleNamespace
 from typing import Any
 
@@ -10,6 +11,7 @@ from support.makers import run_info
 from launch_scripts.commands import swarm_route
 from swarm.client import BusError
 from swarm.client import connected_swarm as client
+from swarm.client.session import Session
 from swarm.client.terrain_frame import Frame
 from swarm.errors import NoAnswerError
 from swarm.grid import GridSpec
@@ -47,7 +49,8 @@ def ask(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Any:
             asked.append(1)
             return Future()
 
-        session: Any = SimpleNamespace(run=info, frame=Frame.of(info), ask=ask, answers=answers)
+        number = partial(Session.number, SimpleNamespace())
+        session: Any = SimpleNamespace(run=info, frame=Frame.of(info), ask=ask, answers=answers, number=number)
         route = client.Swarm(session).route((5.0, -5.0), (15.0, -5.0))
         return route.cells[-1], len(asked)
 
