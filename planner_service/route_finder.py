@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import reprlib
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -91,7 +92,7 @@ class RouteFinder:
         On a pace that is NaN, zero or negative, masked or true, an array without two dimensions, or an unknown
         strategy.
     TypeError
-        On a row or column that is no whole number.
+        On a row or column that is no whole number, a resolution that is none, or a climb of another type.
     ConfigError
         On a setting that does not exist, or may not have this value.
     """
@@ -109,6 +110,8 @@ class RouteFinder:
         if self._pace.ndim != 2:
             raise ValueError(f"pace has {self._pace.ndim} dimensions, expected 2")
         rows, cols = self._pace.shape
+        _check_type("resolution_m", resolution_m, float | int | np.number)
+        _check_type("climb", climb, Climb | None)
         self.grid = GridSpec(rows, cols, resolution_m)
         self._config = converted({"strategy": "full", **settings}, PlannerConfig, "RouteFinder", "settings")
         if (strategy := self._config.strategy) not in STRATEGIES:
@@ -186,8 +189,9 @@ class RouteFinder:
         those up to 64 cells back, with growing gaps, and the turn before.
 
         Raises ValueError where uphill is not downhill on the ground, on a route that does not lead to a target, and
-        on one that the map's changes have shut.
+        on one that the map's changes have shut; TypeError on anything else.
         """
+        _check_type("route", route, FoundRoute)
         puller = self._puller
         if route.status is not RouteStatus.OK:
             raise ValueError(
@@ -225,11 +229,18 @@ class RouteFinder:
             tree.take_strides(tree.stride_job()())
 
 
+def _check_type(name: str, value: object, kind: Any) -> None:
+    """Raises TypeError unless a value is of this type; Python takes True for 1."""
+    if isinstance(value, bool) or not isinstance(value, kind):
+        raise TypeError(f"{name} is {reprlib.repr(value)}, expected {getattr(kind, '__name__', kind)}")
+
+
 def _whole(place: Any) -> tuple[int, int]:
-    """A place as a cell. Raises TypeError if row or column is not whole: half a row may be half a map away."""
+    """A place as a cell. Raises TypeError if row or column is not whole, as half a row may be half a map away, or
+    has more than 64 bits."""
     try:
-        row, col = map(whole, place)
-    except (TypeError, ValueError) as error:
+        row, col = map(int, np.array([whole(each) for each in place], np.int64))
+    except (TypeError, ValueError, OverflowError) as error:
         raise TypeError(f"{place!r} is no cell, which is two whole numbers, such as 1, 1") from error
     return row, col
 

@@ -105,9 +105,14 @@ def test_a_place_between_cells_and_an_unknown_setting_are_refused() -> None:
     for call in (finder.route, lambda *place: finder.move(place), lambda *place: finder.change([[1.0]], *place)):
         with pytest.raises(TypeError, match=r"\(2\.9, 1\) is no cell, which is two whole numbers"):
             call(2.9, 1)
-    for place in ((1, 1, 1), (1,), "11", 1, (1, np.nan), (True, 1), (np.True_, 1)):
+    for place in ((1, 1, 1), (1,), "11", 1, (1, np.nan), (True, 1), (np.True_, 1), (10**30, 1)):
         with pytest.raises(TypeError, match="is no cell"):
             finder.between((1, 1), place)  # type: ignore[arg-type]
+    for key, odd in (("resolution_m", True), ("resolution_m", "10"), ("climb", "up")):
+        with pytest.raises(TypeError, match=f"{key} is {odd!r}, expected"):
+            RouteFinder(np.ones((6, 6)), **{key: odd})
+    with pytest.raises(TypeError, match="route is None, expected FoundRoute"):
+        finder.pull(None)  # type: ignore[arg-type]
     for key, value, words in (
         ("strateg", "full", "'strategy'"),
         ("edge", "pap", "'paper'"),
