@@ -162,6 +162,7 @@ def new_run_id() -> str:
 
 
 _HIGHEST = 1 << 61
+"""Highest incarnation that is read from a file: half of what a token may say (2^62), so that one more fits."""
 _DIGITS = 20
 """Width of the number in a file of incarnations, which never changes."""
 
