@@ -26,7 +26,7 @@ an earlier one. Values are returned; no step calls back. The bus and the codec p
 6. `tree/cost_to_go.py`: `CostToGoTree.move` grows a window with the kernels. A large exact tree uses
    `tree/partitioned_tree.py` instead.
 7. `followers.py`: `Followers.touch` marks the routes that a change concerns, `due` selects those to push now.
-8. `tree/route_bounds.py`: `read_routes` reads their new routes with proven bounds.
+8. `tree/route_bounds.py`: `read_routes`, called by `TargetTree.routes`, reads new routes with proven bounds.
 9. `any_angle_routes.py`: `Puller.pull_batch` straightens them if the scenario says so.
 10. `service.py`: `_perform` publishes each `PushedRoute`.
 

@@ -28,6 +28,7 @@ PACKAGE = "terrain-swarm"
 _ENOUGH_BYTES = 1 << 30
 """Minimum of free memory, and of free disk."""
 _ENOUGH_FILES = 1024
+"""Open files that a process may need; fewer are warned of. Chosen, not measured."""
 _LARGEST_FIRST = ("all", "view", "vectors", "roles", "terrain", "planner")
 """Extras of a swarm: each brings more packages than those after it."""
 _UNSYNCHRONISED = 5
@@ -41,6 +42,7 @@ _TREE_CELL_BYTES = 24
 _BUSY_SHARE = 3 / 4
 """Beyond this share of the cores ticks are late: none of them at 1.4 cores of 2, 10 % at 1.9."""
 _FEW_AGENTS = 5
+"""Agents up to which no larger `per_agent` is advised. Chosen, not measured."""
 _CELL_BYTES = 30
 """Bytes of the terrain, which all processes share, and of its file in the folder of a run."""
 _RECORDING_BYTES_PER_MINUTE = 20 << 20

@@ -40,6 +40,7 @@ RunArgument = Annotated[
 _DOWN_S = 120.0
 """A launcher that is asked to end gives each role five seconds, then writes its report."""
 _TURN_S = 0.2
+"""Interval of looks for new lines, and for the end of a run. Chosen, not measured."""
 _MOST_LINES = 1_000_000
 """Lines that are held for `--lines`: at most a few hundred MB."""
 _Line = tuple[float, str, str]

@@ -118,6 +118,7 @@ class Tls:
 RunOption = Annotated[str | None, from_environment("SWARM_RUN", autocompletion=complete_runs)]
 RunsHere = Annotated[Path | None, from_environment("SWARM_RUNS")]
 _CONNECT_S = 3.0
+"""Time for a command to reach a router. Chosen, not measured."""
 _NEWEST = 50
 """Number of runs that are tried: each costs a connection to a port of this machine."""
 _NAMED = 3

@@ -37,6 +37,7 @@ LINK_SHARE = 0.5
 OVERHEAD_BYTES = 100
 """Overhead of a message on a link: key, Zenoh's and TCP/IP's headers. Assumed, not measured."""
 MOST_MACHINES = 2000
+"""Machines that are tried one after another: bounds the time. Chosen, not measured."""
 MOST_SESSIONS = 8192
 """`transport/unicast/max_sessions` of a router (swarm/bus/zenoh_config.py)."""
 LEAST_SIDE = 32

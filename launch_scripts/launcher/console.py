@@ -34,7 +34,9 @@ Tell = Callable[[str, float], None]
 _PATIENCE_S = 1.0
 """Shorter work has no progress line."""
 _PLAIN_EVERY_S = 5.0
+"""Interval of lines where there is no table. Chosen, not measured."""
 _BUSY_EVERY_S = 0.2
+"""Interval of what changes in its place. Chosen, not measured."""
 _TABLE_EVERY_S = 1.0
 """The table's content is made once a second (`Recorder.shown`)."""
 _READER_GONE = frozenset((errno.EPIPE, errno.EIO, errno.EBADF, errno.ENXIO))

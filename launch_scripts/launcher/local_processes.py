@@ -30,15 +30,19 @@ from swarm.runtime.role_setup import RoleSetup
 log = logging.getLogger(__name__)
 
 FIRST_WAIT_S = 0.2
+"""Wait before a crashed process is started again. Chosen, not measured."""
 LONGEST_WAIT_S = 5.0
+"""The wait doubles with each further crash, up to this. Chosen, not measured."""
 SETTLED_S = 10.0
 """After a run of this length (s) the wait starts at its shortest again."""
 STOP_GRACE_S = 5.0
+"""Time of a process to end in order, before it is killed. Chosen, not measured."""
 FORCED_GRACE_S = 1.0
 """For all that still run, at once, when the end is asked for a second time."""
 REFUSALS_ALLOWED = 5
 """This number of refusals within `REFUSALS_WITHIN_S` is final."""
 REFUSALS_WITHIN_S = 60.0
+"""Time within which refusals count together. Chosen, not measured."""
 FINALLY_REFUSED_WAIT_S = 60.0
 """Wait before the next start of an expendable process whose refusal is final."""
 

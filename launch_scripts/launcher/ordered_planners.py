@@ -18,6 +18,7 @@ LEAVES_TO_OTHERS_S = 3.0
 """A launcher of a part of a swarm starts such a planner only if none has appeared for this time."""
 
 _BEGIN_AT_ONCE = 2
+"""Planners for added targets that start at one time. Chosen, not measured."""
 _BEGINS_WITHIN_S = 10.0
 """A planner that has not come up by then holds up no other."""
 

@@ -163,6 +163,7 @@ def new_run_id() -> str:
 
 
 _HIGHEST = (1 << 62) - 2
+"""Highest incarnation that is read from a file: a token may say less than 2^62, and the next one is one more."""
 _DIGITS = 20
 """Width of the number in a file of incarnations, which never changes."""
 

@@ -58,10 +58,13 @@ from swarm.wire.messages.processes import RunInfo
 log = logging.getLogger(__name__)
 
 _TURN_S = 0.05
+"""Pause of the launcher's loop at the start and the end of a run. Chosen, not measured."""
 _CALM_TURN_S = 0.1
 """Once all processes are up: each turn takes a third of a millisecond."""
 _LISTEN_WITHIN_S = 20.0
+"""Time for the own router to listen. Chosen, not measured."""
 _UP_WITHIN_S = 60.0
+"""Time for the start, added to the scenario's seconds until all processes are up. Chosen, not measured."""
 _RELOADED_WITHIN_S = 10.0
 """A viewer that leaves may be a page that is loaded again."""
 _ELSEWHERE = f"the run is recorded and reported by the launcher that starts {RECORDED_BESIDE}"

@@ -48,6 +48,7 @@ _EVERY_S = {"photo": 1.0, "cost": 5.0, "known": 5.0, "learned": 5.0, "nearest": 
 _UNSEEN = 4
 """Factor by which the ground is drawn less often without viewers, for the recording."""
 _TILES_AT_ONCE = 80
+"""Tiles of a layer that are drawn in one turn: bounds its time. Chosen, not measured."""
 _NAMES_SHOWN = 40
 _MOST_TARGETS = 256
 """Targets beside the scenario's of which planners may tell: nothing grows with the names that anybody makes up."""

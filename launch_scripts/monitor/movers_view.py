@@ -281,6 +281,7 @@ SILENT_NS = 5 * NS_PER_S
 _FAINT, _FULL = 40, 235
 """Opacity of the least and of the likeliest place of a belief."""
 _CIRCLE_POINTS = 33
+"""The last point is the first: 32 sides. Chosen, not measured."""
 _SMALLEST = 0.45
 """Radius below which nothing is drawn, as a share of `TerrainMesh.scale_m`: a rover of 2 m is seen on 10 km."""
 _PIN, _LABEL, _ALARM, _FLAG = 2.2, 5.4, 4.6, 1.8

@@ -45,6 +45,7 @@ Ten chunks a second take its threads five times the CPU, and twice the space."""
 STILL_CHECKS = 5
 """Checks in a row, one a second, that find the file as long as before: something is drawn every second."""
 _RETRY_S = 10.0
+"""Pause after a failure to write. Chosen, not measured."""
 _SPACE_BYTES = 8 << 20
 """Space from which on a new recording is begun."""
 

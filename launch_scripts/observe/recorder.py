@@ -271,12 +271,14 @@ _NO_GAP: dict[str, Any] = {"routes": 0, "certified_gap": None}
 
 _SAMPLE_NS = NS_PER_S
 _MOST_SAMPLES = 1024
+"""Samples that are kept of a run, however long it is (`Thinned`). Chosen, not measured."""
 _POINTS = 120
 """Instants in a report: a plot of it is some 300 pixels wide."""
 _TRACK_NS = int(TRACK_S * NS_PER_S)
 _MOST_PLACES = 400_000
 """Sampled places that are kept at most, of vehicles and of targets each."""
 _NOTES_KEPT = 1000
+"""The newest ones. Chosen, not measured."""
 _ROUTE_BYTES = 4_000_000
 """Size of all routes that are kept."""
 _OF_ROUTE_BYTES = 400

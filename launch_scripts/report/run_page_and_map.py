@@ -55,6 +55,7 @@ from swarm.grid import GridSpec
 from swarm.wire.messages.map_data import MarkKind
 
 _SHOWN_LABELS = 30
+"""Targets up to which the map names each. Chosen, not measured."""
 _MOST_PIXELS = 1 << 20
 """Limit for pictures of marks and of learned factors: of a larger grid, blocks of cells."""
 _MOST_POINTS = 60_000
@@ -349,6 +350,7 @@ def _draw_head(figure: Figure, report: dict[str, Any]) -> None:
 
 PAGE_FILE = "report.html"
 _NOTES_SHOWN = 400
+"""The newest ones. Chosen, not measured."""
 _ROWS_SHOWN = 2000
 _MAP_IN = 10.0
 """The longer side of the map."""

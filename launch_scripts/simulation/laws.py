@@ -46,7 +46,9 @@ from vehicle_agent.start_cells import spawn_cells
 from vehicle_agent.traffic.obstacles import capsule_of
 
 LONGEST_WAIT_S = 10.0
+"""Time that a vehicle may wait without a reason."""
 ROUTED_WITHIN_S = 5.0
+"""Time from a vehicle's first request to its first route."""
 SLOW_MS = 200.0
 """From this delay of every message on the two limits above do not hold: a grant of a cell takes some round trips,
 and in a crowd the vehicles behind wait for each. All other laws hold at any delay."""

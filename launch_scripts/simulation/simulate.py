@@ -33,6 +33,7 @@ from swarm.runtime.process import collected_rarely
 from swarm.wire.access import Authenticator
 
 BOOT_SPREAD_S = 0.3
+"""Time within which the processes of a simulation start, each at a random instant. Chosen, not measured."""
 _STEPS_PER_S = 10
 """Reports of progress in a simulated second."""
 BACKOFF_S = 0.5

@@ -41,6 +41,7 @@ _START_PAGE = f'<!doctype html><title>terrain swarm</title><body><script src="{_
 _POLLED_WITHIN_S = 5.0
 """Pages poll once a second; a machine that draws without a graphics card is late at times."""
 _READY_WITHIN_S = 20.0
+"""Time for the viewer's server to answer. Chosen, not measured."""
 PORT_PATIENCE_S = 3.0
 """A port that is in use is waited for at most this time: after a restart the one before may still have it."""
 _LASTS_S = 120.0

@@ -17,9 +17,13 @@ from swarm.clock import NS_PER_S
 
 BEAT_NS = NS_PER_S
 REPORT_NS = NS_PER_S // 10
+"""Ten reports a second, as `vehicles.tick_hz` of agents."""
 _ASK_NS = 2 * NS_PER_S
+"""Interval of requests for positions, while none come. Chosen, not measured."""
 _POSITIONS_US = 100_000
+"""Interval of positions that is asked for, us: that of reports."""
 _SAY_AGAIN_NS = 60 * NS_PER_S
+"""The minute of `_MOST_SAID`."""
 _MOST_SAID = 64
 """Sentences a minute; a vehicle's own take up a quarter at most."""
 _WARN_NS = 4 * NS_PER_S

@@ -14,6 +14,7 @@ from launch_scripts.gateways.mavlink import mavlink_codec as codec
 from swarm.clock import NS_PER_S
 
 ARDUPILOT, PX4 = 3, 12
+"""MAV_AUTOPILOT of MAVLink's common messages."""
 _UNKNOWN_TYPE = 0
 _DRIVES = frozenset({10, 11})
 """MAV_TYPE of rovers and boats."""

@@ -23,10 +23,13 @@ MOST_POINTS = 60
 """Limit of one mission: further points are uploaded when half of it is driven. Uploads take a round trip an
 item."""
 _STRAIGHT = 1e-9
+"""Sine of the angle up to which three places lie on a line: rounding alone."""
 _NEXT_NS = 3 * NS_PER_S
 """From one mission to the next: a target that moves changes its routes several times a second."""
 _AFTER_FAILURE_NS = 5 * NS_PER_S
+"""Pause after a mission that a vehicle did not take. Chosen, not measured."""
 _ON_GROUND_M = 2.0
+"""Height over home below which an aircraft counts as on the ground. Chosen, not measured."""
 RETRY_NS = NS_PER_S * 3 // 2
 MOST_TRIES = 5
 """The protocol demands both: a word is said again after 1.5 s without an answer, five times in all."""

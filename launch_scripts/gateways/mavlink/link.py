@@ -19,7 +19,9 @@ from typing import Any
 from swarm.errors import BusError, ConfigError
 
 _MOST_BYTES = 65536
+"""Bytes that are read at once: no UDP datagram has more."""
 _OPEN_AGAIN_S = 1.0
+"""Pause between two attempts to open a link. Chosen, not measured."""
 _PATIENCE_S = 0.3
 """A TCP peer which has not answered by then is tried again later: nothing else is done meanwhile."""
 _BAUD = 57600

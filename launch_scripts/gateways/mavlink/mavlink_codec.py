@@ -20,17 +20,25 @@ AUTOPILOT = 1
 NAV_WAYPOINT, NAV_LOITER_UNLIM, NAV_TAKEOFF = 16, 17, 22
 DO_SET_MODE, MISSION_START, ARM_DISARM, SET_MESSAGE_INTERVAL = 176, 300, 400, 511
 GLOBAL_POSITION_INT = 33
+"""The numbers of MAV_CMD above, and of a message, are those of MAVLink's common messages."""
 ABOVE_HOME, ABOVE_TERRAIN = 6, 11
 """Frames of latitudes and longitudes times 1e7: GLOBAL_RELATIVE_ALT_INT and GLOBAL_TERRAIN_ALT_INT."""
 ACCEPTED, IN_PROGRESS = 0, 5
+"""MAV_RESULT."""
 _INVALID_AUTOPILOT = 8
+"""MAV_AUTOPILOT of what flies nothing, such as a camera."""
 _ONBOARD_CONTROLLER, _ACTIVE = 18, 4
+"""MAV_TYPE and MAV_STATE of our heartbeat."""
 _ARMED = 128
+"""MAV_MODE_FLAG_SAFETY_ARMED."""
 _WARNING = 4
+"""MAV_SEVERITY."""
 _CANCELLED = 15
+"""MAV_MISSION_OPERATION_CANCELLED."""
 _POSITION_ONLY, _PLACE_ONLY = 0x0DF8, 0x0DFC
 """Type masks of a setpoint: the fields that are ignored. The second ignores the height, too."""
 _NOT_KNOWN = 65535
+"""Heading that a vehicle does not know (GLOBAL_POSITION_INT.hdg)."""
 _SIGNING_EPOCH_S = 1_420_070_400
 """2015-01-01, from which signatures count in units of 10 us."""
 _LONGEST_REST = 512

@@ -15,6 +15,7 @@ from launch_scripts.stop_requests import stop_requests
 from swarm.client import ConfigError, Frame, Route, Stream, Swarm, SwarmError, Vehicle
 
 _TURN_S = 0.02
+"""Time that a turn waits for bytes: work is late by so much at most. Chosen, not measured."""
 _MOST_READ = 200
 """Pieces read in one turn, so that a flood leaves time for due work."""
 _LAST_WORDS = 3

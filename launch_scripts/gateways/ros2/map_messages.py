@@ -49,6 +49,7 @@ _WHOLE_NS, _CELLS_AT_ONCE = 10 * NS_PER_S, 1 << 20
 more cells than a million."""
 Cells = NDArray[np.int64]
 _DELETE_ALL = 3
+"""visualization_msgs/Marker.DELETEALL."""
 _LINE_CELLS = 0.15
 """Width of lines, in sides of a cell."""
 

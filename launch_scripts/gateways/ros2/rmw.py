@@ -18,6 +18,7 @@ TOKEN_SPACE = "@ros2_lv"
 NO_HASH = "TypeHashNotSupported"
 """Stands for the hash where a distribution has none: Humble."""
 _GID_BYTES = 16
+"""Bytes of an endpoint's id in an attachment of rmw_zenoh."""
 _ATTACHMENT = struct.Struct(f"<qqB{_GID_BYTES}s")
 _TOKEN_PARTS = 13
 """Parts of an endpoint's token that every version has. Newer ones append, which is left unread."""

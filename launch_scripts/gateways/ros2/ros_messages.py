@@ -27,11 +27,14 @@ TERRAIN_FRAME = "terrain"
 ODOMETRY, PATH = "nav_msgs/msg/Odometry", "nav_msgs/msg/Path"
 POSE, TRANSFORMS = "geometry_msgs/msg/PoseStamped", "tf2_msgs/msg/TFMessage"
 _LAST_NS = (1 << 31) * NS_PER_S - 1
+"""Seconds of builtin_interfaces/Time are an int32."""
 _MOST_PATHS = 256
 """Lengths of paths whose bytes are kept: 9 MB for 300 poses each."""
 _STAMP, _POSE, _TWIST = struct.Struct("<iI"), struct.Struct("<7d"), struct.Struct("<6d")
 _COVARIANCE_BYTES = 36 * 8
+"""36 float64, at the end of a message."""
 _LEVEL = (0.0, 0.0, 0.0, 1.0)
+"""The quaternion (x, y, z, w) of no turn."""
 Metres = TypeVar("Metres", float, NDArray[np.float64])
 Place = tuple[float, float, float | None]
 """x, y in metres of the terrain, heading clockwise from north."""

@@ -33,6 +33,7 @@ from swarm.config.setting_types import Name, Options, Positive, Section
 from swarm.errors import ConfigError
 
 MOST_TRIALS = 1_000_000
+"""A larger number is a slip. Chosen, not measured."""
 SMALL_WORLDS = (MIX, *WORLDS)
 STUDIES = Path(__file__).parents[2] / "studies"
 """The project's own."""

@@ -16,10 +16,12 @@ from launch_scripts.simulation.study.study import Case, Study
 from launch_scripts.simulation.trials import SECONDS, Result, Trial, replay_of
 
 LEVEL = 0.95
+"""Confidence of all intervals: the usual one."""
 MOST_BOOTSTRAPPED = 1000
 """Above this number of values the mean is practically normal, and Student's t gives the same result without
 delay."""
 _RESAMPLES = 9999
+"""SciPy's default."""
 _SAME = 1e-12
 """Values that differ by less, relative to the largest, are one: rounding."""
 METHOD = (

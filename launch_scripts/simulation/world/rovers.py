@@ -16,6 +16,7 @@ from swarm.config.scenario import RoverConfig, Scenario, ids_of
 from swarm.wire.messages.vehicles import MOST_M_PER_S, Obstacle
 
 LEASE_S = 2.0
+"""Lease of a rover's reports. Chosen, not measured."""
 TURN_S = 0.6
 """Time of a turn, during which its new heading is published already."""
 _LONGEST_REST_S = 8.0

@@ -40,10 +40,13 @@ planner to appear."""
 PATIENCE_NS = 5 * NS_PER_S
 """It waits this time for the answer of a planner that is alive."""
 JUMP_COOL_DOWN_NS = 2 * NS_PER_S
+"""Time after a capture in which a target that jumps cannot be caught. Chosen, not measured."""
 STAY_COOL_DOWN_NS = 5 * NS_PER_S
+"""The same of a target that stays where it was caught. Chosen, not measured."""
 TRACKER = "targets"
 """The name under which this process and its standbys tell poses: a later generation takes over at once."""
 _WAYS_PER_TICK = 1
+"""Ways of all targets that are computed in one tick: bounds its time."""
 _MOST_COUNTED = 1 << 32
 """Captures and jumps that another process may have counted: more is a lie, and leaves no room to count on."""
 

@@ -23,6 +23,7 @@ from swarm.config.agent_plan import agent_of
 log = logging.getLogger(__name__)
 
 MOST_ROBOTS = 256
+"""Robots of one gateway: bounds its memory and the time of a tick. Chosen, not measured."""
 _LOOK_NS = NS_PER_S // 2
 """Interval of looks at the swarm's own vehicles."""
 _MOST_ASKED = 16

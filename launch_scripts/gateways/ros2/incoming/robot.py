@@ -23,9 +23,11 @@ log = logging.getLogger(__name__)
 _PATIENCE_S = 5.0
 """A planner that starts, or grows the tree of a new goal, answers within this time on the demo's terrain."""
 MOST_ASKED = 64
+"""Questions for routes that wait; further ones are refused. Chosen, not measured."""
 ROUTE_THREADS = 16
 """A route takes milliseconds; only one whose planner is busy or missing takes as long as `_PATIENCE_S`."""
 _MOST_POSTED = 64
+"""Results that wait for the gateway's thread; the oldest are dropped first. Chosen, not measured."""
 _TARGET_FRAMES = "targets/"
 """A goal in the frame "targets/ID" is the target itself, wherever it is."""
 

@@ -28,6 +28,7 @@ from swarm.wire.messages.vehicles import MOST_M_PER_S
 _STANDS_M_PER_S = 0.05
 """A slower robot is at rest: odometry at rest is seldom exactly 0."""
 _MOST_M = 1e12
+"""Bound on coordinates, as of places in a scenario (`setting_types.Metres`)."""
 _LEAST_GAP_NS, _MOST_GAP_NS = NS_PER_S // 50, 2 * NS_PER_S
 """Two poses tell a speed if they are not nearer in time, nor further apart."""
 MOST_CELLS = 1 << 16
@@ -35,6 +36,7 @@ MOST_CELLS = 1 << 16
 _MOST_WORK = 1 << 25
 """Numbers that resampling may hold at once."""
 _LEAST_SIDE_M = 1e-3
+"""A millimetre: a finer grid is damaged."""
 _COVERED = 0.5
 """A cell of the terrain is closed if so much of it is known and occupied."""
 
