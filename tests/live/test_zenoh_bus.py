@@ -19,7 +19,7 @@ import pytest
 import zenoh
 from support.bus_behaviour import *  # noqa: F403
 from support.bus_behaviour import MARKS, TRUE_POSE
-from support.bus_world import Box, answering, asked, marks, pose
+from support.bus_world import Box, answering, asked, heard_by, marks, pose
 from support.makers import cost_reply, run_info
 from support.processes import eventually
 from support.query_behaviour import *  # noqa: F403
@@ -263,9 +263,7 @@ def test_threads_that_post_replies_keep_what_python_knows_of_them(world):
 
 
 def test_garbage_is_logged_once_per_topic_whatever_its_keys(world, caplog):
-    a, b, box = world.bus("a"), world.bus("b"), Box()
-    b.subscribe(POSE, box)
-    world.settle()
+    a, b, _ = heard_by(world, POSE)
     for n in range(40):
         world.put_bytes(a, POSE, b"garbage", target=f"t{n}")
     world.until(lambda: b.counts["payloads_dropped"] == 40)
