@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import json
-import os
 import signal
 import subprocess
 import sys
@@ -18,7 +17,7 @@ from support.processes import eventually
 
 from swarm.bus.zenoh_bus import open_bus
 from swarm.client import connect
-from swarm.grid import GridSpec
+from swarm.grid import GridSpec, walk
 from swarm.right_of_way.external_session import ExternalSession
 from swarm.right_of_way.generations import GenerationFile
 from swarm.runtime.run_secret import authenticator_of
@@ -41,17 +40,12 @@ def run(live: LiveSwarm) -> RunInfo:
 
 def route_of(live: LiveSwarm, grid: GridSpec) -> list[int]:
     """The first cells of a route to a target."""
-    steps = ((-1, 0), (-1, 1), (0, 1), (1, 1), (1, 0), (1, -1), (0, -1), (-1, -1))
     with client(live.network) as bus:
         for n in range(10, 90, 7):
             (reply,) = ask(bus, ROUTE, RouteRequest(row=n, col=n, max_cells=12), target="t0")
             route = reply.routes[0]
             if route.status is RouteStatus.OK and len(route.directions) >= 12:
-                path = [grid.cell(n, n)]
-                for code in route.directions:
-                    row, col = grid.row_col(path[-1])
-                    path.append(grid.cell(row + steps[code][0], col + steps[code][1]))
-                return path
+                return walk(grid, route.start, route.directions)
     raise AssertionError("no route of twelve cells from anywhere")
 
 
@@ -169,7 +163,6 @@ def test_vehicles_of_a_killed_process_stay_until_it_is_back_or_a_person_says_tha
 
 
 def test_nobody_has_met_anybody(live: LiveSwarm) -> None:
-    os.killpg(live.process.pid, signal.SIGINT)
-    live.process.wait(60)
+    live.end()
     report = json.loads((live.run_dir / "report.json").read_text())
     assert report["collisions"] == 0
