@@ -49,13 +49,6 @@ def route_of(live: LiveSwarm, grid: GridSpec) -> list[int]:
     raise AssertionError("no route of twelve cells from anywhere")
 
 
-def drive(rover: ExternalSession, path: list[int]) -> None:
-    rover.want(path)
-    for here, there in pairwise(path):
-        assert rover.may_enter(there, timeout_s=20.0), (rover.cells, there, rover.warnings)
-        rover.left(here)
-
-
 ROVER = """
 import sys, time
 from pathlib import Path
@@ -92,7 +85,10 @@ def test_ones_own_program_drives_dies_comes_back_and_leaves(live: LiveSwarm, run
         assert not other.enter(path[5], timeout_s=4.0)
         with session_of(live, run, "rover", tmp_path / "rover") as rover:
             assert rover.enter(path[5], timeout_s=10.0)
-            drive(rover, path[5:])
+            rover.want(path[5:])
+            for here, there in pairwise(path[5:]):
+                assert rover.may_enter(there, timeout_s=20.0), (rover.cells, there, rover.warnings)
+                rover.left(here)
             assert other.may_enter(path[5], timeout_s=10.0)  # what it has asked for all the time
         assert other.leave(timeout_s=10.0)
         assert other.enter(path[-1], timeout_s=10.0)  # the rover has left
