@@ -9,7 +9,7 @@ from __future__ import annotations
 import socket
 import ssl
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack
 from dataclasses import dataclass
 from pathlib import Path
@@ -195,14 +195,13 @@ class Trial:
             self.tried.delete(key)
 
     def _collect(self, got: set[str], stack: ExitStack) -> None:
-        everything = self.counterpart.declare_subscriber(ALL, lambda sample: got.add(str(sample.key_expr)))
+        everything = self.counterpart.declare_subscriber(ALL, adding(got))
         stack.callback(everything.undeclare)
         time.sleep(SETTLE_S)
 
     def _hear(self, keys: list[str], got: set[str], stack: ExitStack) -> None:
         for key in forms(keys):
-            subscriber = self.tried.declare_subscriber(key, lambda sample: got.add(str(sample.key_expr)))
-            stack.callback(subscriber.undeclare)
+            stack.callback(self.tried.declare_subscriber(key, adding(got)).undeclare)
         time.sleep(SETTLE_S)
         for key in keys:
             self.counterpart.put(concrete(key), b"x")
@@ -226,18 +225,14 @@ class Trial:
         got |= replies(self.counterpart, ALL)
 
     def _raise(self, keys: list[str], got: set[str], stack: ExitStack) -> None:
-        watcher = self.counterpart.liveliness().declare_subscriber(
-            ALL, lambda sample: got.add(str(sample.key_expr)), history=True
-        )
+        watcher = self.counterpart.liveliness().declare_subscriber(ALL, adding(got), history=True)
         stack.callback(watcher.undeclare)
         for key in keys:
             stack.callback(self.tried.liveliness().declare_token(key).undeclare)
 
     def _watch(self, keys: list[str], got: set[str], stack: ExitStack) -> None:
         for key in forms(keys):
-            watcher = self.tried.liveliness().declare_subscriber(
-                key, lambda sample: got.add(str(sample.key_expr)), history=True
-            )
+            watcher = self.tried.liveliness().declare_subscriber(key, adding(got), history=True)
             stack.callback(watcher.undeclare)
         for key in keys:
             stack.callback(self.counterpart.liveliness().declare_token(key).undeclare)
@@ -248,6 +243,11 @@ class Trial:
         time.sleep(SETTLE_S)
         for key in keys:
             got |= {str(each.ok.key_expr) for each in self.tried.liveliness().get(key, timeout=1.0) if each.ok}
+
+
+def adding(got: set[str]) -> Callable[[zenoh.Sample], None]:
+    """A listener that notes the keys of samples."""
+    return lambda sample: got.add(str(sample.key_expr))
 
 
 def forms(keys: list[str]) -> list[str]:
@@ -293,17 +293,13 @@ class Stage:
     def network(self, name: str, **changes: object) -> NetworkConfig:
         if not (self.folder / f"{name}.pem").exists():
             issue(self.folder, name, [], 2)
-        tls = TlsConfig(
-            ca=str(self.folder / "ca.pem"),
-            certificate=str(self.folder / f"{name}.pem"),
-            key=str(self.folder / f"{name}.key"),
-        )
+        ca, certificate, key = (str(self.folder / file) for file in ("ca.pem", f"{name}.pem", f"{name}.key"))
         network = NetworkConfig(
             listen=(self.endpoint,),
             connect=(self.endpoint,),
             admit=("router.0", "router.north", *NAMES.values(), REVOKED, ISSUED_AGAIN),
             revoked=(REVOKED, ISSUED_AGAIN),
-            tls=tls,
+            tls=TlsConfig(ca=ca, certificate=certificate, key=key),
         )
         return msgspec.structs.replace(network, **changes)
 

@@ -21,16 +21,12 @@ pytestmark = [pytest.mark.network, pytest.mark.slow]
 ROWS, COLS = 300, 280
 
 
-def write_ridge(path: Path) -> None:
-    """A hill of 300 m, as a GeoTIFF of 30 m cells."""
+def scenario_of_a_file(folder: Path) -> Path:
+    """The small scenario, on `ridge.tif` beside it: a hill of 300 m, as a GeoTIFF of 30 m cells."""
+    folder.mkdir(exist_ok=True)
     south, east = np.mgrid[0:ROWS, 0:COLS].astype(np.float32)
     height_m = 300 * np.exp(-((south - 150) ** 2 + (east - 140) ** 2) / 2 / 60**2).astype(np.float32)
-    written(path, height_m, transform=from_origin(500_000, 5_000_000, 30, 30))
-
-
-def scenario_of_a_file(folder: Path) -> Path:
-    """The small scenario, on `ridge.tif` beside it."""
-    folder.mkdir(exist_ok=True)
+    written(folder / "ridge.tif", height_m, transform=from_origin(500_000, 5_000_000, 30, 30))
     path = folder / "small.toml"
     text = write_scenario(folder).read_text()
     head, rest = text.split("[terrain]")
@@ -41,7 +37,6 @@ def scenario_of_a_file(folder: Path) -> Path:
 
 def test_planner_and_agents_without_the_file_drive_on_the_keepers_base_map(hands: Hands) -> None:
     here = scenario_of_a_file(hands.folder / "here")
-    write_ridge(here.parent / "ridge.tif")
     there = hands.folder / "there" / "small.toml"
     there.parent.mkdir()
     there.write_text(here.read_text())

@@ -52,11 +52,6 @@ def test_a_swarm_of_twenty_is_measured(temporary: Path) -> None:
     assert list(temporary.glob("swarm-bench-*")) == []
 
 
-def running(runs: Path) -> dict[str, int]:
-    """Processes of all runs in a folder."""
-    return {name: pid for run_dir in folders_of_runs(runs) for name, pid in processes(run_dir).items()}
-
-
 @pytest.mark.thorough
 def test_a_swarm_that_is_killed_lied_to_and_stopped_recovers_and_all_is_counted(tmp_path: Path) -> None:
     runs = tmp_path / "runs"
@@ -72,7 +67,7 @@ def test_a_swarm_that_is_killed_lied_to_and_stopped_recovers_and_all_is_counted(
     [run_dir] = folders_of_runs(runs)
     whole = json.loads((run_dir / "chaos.json").read_text())
     assert whole["minutes"][0]["agent_mb"] > 20
-    assert running(runs) == {}
+    assert processes(run_dir) == {}
 
 
 def test_an_unknown_blow_or_scenario_is_named(tmp_path: Path) -> None:

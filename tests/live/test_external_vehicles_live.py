@@ -4,7 +4,6 @@
 from __future__ import annotations
 
 import json
-import os
 import signal
 import subprocess
 import sys
@@ -18,7 +17,7 @@ from support.processes import eventually
 
 from swarm.bus.zenoh_bus import open_bus
 from swarm.client import connect
-from swarm.grid import GridSpec
+from swarm.grid import GridSpec, walk
 from swarm.right_of_way.external_session import ExternalSession
 from swarm.right_of_way.generations import GenerationFile
 from swarm.runtime.run_secret import authenticator_of
@@ -41,25 +40,13 @@ def run(live: LiveSwarm) -> RunInfo:
 
 def route_of(live: LiveSwarm, grid: GridSpec) -> list[int]:
     """The first cells of a route to a target."""
-    steps = ((-1, 0), (-1, 1), (0, 1), (1, 1), (1, 0), (1, -1), (0, -1), (-1, -1))
     with client(live.network) as bus:
         for n in range(10, 90, 7):
             (reply,) = ask(bus, ROUTE, RouteRequest(row=n, col=n, max_cells=12), target="t0")
             route = reply.routes[0]
             if route.status is RouteStatus.OK and len(route.directions) >= 12:
-                path = [grid.cell(n, n)]
-                for code in route.directions:
-                    row, col = grid.row_col(path[-1])
-                    path.append(grid.cell(row + steps[code][0], col + steps[code][1]))
-                return path
+                return walk(grid, route.start, route.directions)
     raise AssertionError("no route of twelve cells from anywhere")
-
-
-def drive(rover: ExternalSession, path: list[int]) -> None:
-    rover.want(path)
-    for here, there in pairwise(path):
-        assert rover.may_enter(there, timeout_s=20.0), (rover.cells, there, rover.warnings)
-        rover.left(here)
 
 
 ROVER = """
@@ -98,7 +85,10 @@ def test_ones_own_program_drives_dies_comes_back_and_leaves(live: LiveSwarm, run
         assert not other.enter(path[5], timeout_s=4.0)
         with session_of(live, run, "rover", tmp_path / "rover") as rover:
             assert rover.enter(path[5], timeout_s=10.0)
-            drive(rover, path[5:])
+            rover.want(path[5:])
+            for here, there in pairwise(path[5:]):
+                assert rover.may_enter(there, timeout_s=20.0), (rover.cells, there, rover.warnings)
+                rover.left(here)
             assert other.may_enter(path[5], timeout_s=10.0)  # what it has asked for all the time
         assert other.leave(timeout_s=10.0)
         assert other.enter(path[-1], timeout_s=10.0)  # the rover has left
@@ -169,7 +159,6 @@ def test_vehicles_of_a_killed_process_stay_until_it_is_back_or_a_person_says_tha
 
 
 def test_nobody_has_met_anybody(live: LiveSwarm) -> None:
-    os.killpg(live.process.pid, signal.SIGINT)
-    live.process.wait(60)
+    live.end()
     report = json.loads((live.run_dir / "report.json").read_text())
     assert report["collisions"] == 0

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from support.live_swarm import LiveSwarm, running
+from support.live_swarm import SMALL_TERRAIN, LiveSwarm, running
 from support.live_swarm import swarm as command
 from support.processes import eventually
 
@@ -19,20 +19,12 @@ from swarm.client import connect
 
 pytestmark = [pytest.mark.network, pytest.mark.slow]
 
-FLEET = """
+FLEET = f"""
 name = "fleet"
 seed = 3
 seconds = 3600
 time_scale = 20
-
-[terrain]
-source = "synthetic"
-rows = 96
-cols = 128
-resolution_m = 30
-relief_m = 300
-roads = 4
-
+{SMALL_TERRAIN}
 [[targets]]
 walk = "still"
 

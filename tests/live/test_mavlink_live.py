@@ -12,6 +12,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from rasterio.transform import from_origin
 from support.height_models import written
 from support.live_swarm import SWARM, LiveSwarm, running
 from support.processes import eventually
@@ -46,13 +47,6 @@ vehicles = 1
 """
 
 
-def write_ground(path: Path) -> None:
-    from rasterio.transform import from_origin
-
-    heights = np.add.outer(np.sin(np.arange(ROWS) / 5), np.cos(np.arange(COLS) / 7)).astype(np.float32) * 3 + 400
-    written(path, heights, crs="EPSG:32616", transform=from_origin(740_000, 4_030_000, CELL_M, CELL_M))
-
-
 class Child:
     """A process under way, whose output is read from a file."""
 
@@ -77,7 +71,9 @@ class Child:
 @pytest.fixture(scope="module")
 def live(tmp_path_factory: pytest.TempPathFactory) -> Iterator[LiveSwarm]:
     folder = tmp_path_factory.mktemp("mavlink")
-    write_ground(folder / "ground.tif")
+    heights = np.add.outer(np.sin(np.arange(ROWS) / 5), np.cos(np.arange(COLS) / 7)).astype(np.float32) * 3 + 400
+    place = from_origin(740_000, 4_030_000, CELL_M, CELL_M)
+    written(folder / "ground.tif", heights, crs="EPSG:32616", transform=place)
     with running(folder, "--no-live", text=_SCENARIO) as live:
         yield live
 

@@ -6,6 +6,7 @@ import threading
 import time
 
 import pytest
+from support.dummy_roles import Idle
 
 from launch_scripts.ports import free_ports
 from swarm.bus.bus import Asked, AskEnded, Event, Replied, Undecoded
@@ -14,7 +15,6 @@ from swarm.clock import MonotonicClock
 from swarm.config.scenario import NetworkConfig
 from swarm.runtime.inbox import Inbox
 from swarm.runtime.process import Process
-from swarm.runtime.stats import Counters
 from swarm.wire.messages.planning import CostReply, CostRequest
 from swarm.wire.topics import COST
 
@@ -27,11 +27,11 @@ TIMEOUT_S = 1.0
 ASKER = "rover.r1"
 
 
-class Slow:
+class Slow(Idle):
     """Takes 5 ms for each answer and 30 ms for each of ten ticks a second: 140 answers a second at most."""
 
     def __init__(self, bus: ZenohBus, inbox: Inbox) -> None:
-        self.counters = Counters()
+        super().__init__()
         self.answered = self.ticks = 0
         self.turns: set[str] = set()
         """The names by which questions take turns."""
@@ -56,9 +56,6 @@ class Slow:
     def tick(self, now_ns: int) -> None:
         self.ticks += 1
         time.sleep(TICK_S)
-
-    def stop(self, now_ns: int) -> None:
-        pass
 
 
 def test_under_twice_the_load_nine_of_ten_answers_go_to_those_who_still_wait():

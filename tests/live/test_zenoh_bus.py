@@ -19,7 +19,8 @@ import pytest
 import zenoh
 from support.bus_behaviour import *  # noqa: F403
 from support.bus_behaviour import MARKS, TRUE_POSE
-from support.bus_world import Box, answering, asked, marks, pose
+from support.bus_world import Box, answering, asked, heard_by, marks, pose
+from support.dummy_roles import Idle
 from support.makers import cost_reply, run_info
 from support.processes import eventually
 from support.query_behaviour import *  # noqa: F403
@@ -39,7 +40,6 @@ from swarm.peers import Peer
 from swarm.runtime.inbox import Inbox
 from swarm.runtime.operator import Operator
 from swarm.runtime.process import Process
-from swarm.runtime.stats import Counters
 from swarm.wire.access import CODE_BYTES, Authenticator
 from swarm.wire.codec import encode, encode_json
 from swarm.wire.meant_key import meant_for
@@ -156,7 +156,9 @@ def test_the_least_json_of_the_reference_is_heard_on_each_key_where_programs_out
     assert b.counts["payloads_dropped"] == 0
 
 
-def serve_cost(bus: ZenohBus, requests: list[CostRequest]) -> None:
+def serve_cost(bus: ZenohBus) -> list[CostRequest]:
+    """Serves the cost of t0. Returns the requests, as they come."""
+    requests: list[CostRequest] = []
     reply = cost_reply([2.5, float("inf")])
 
     def post(event: object) -> None:
@@ -166,11 +168,11 @@ def serve_cost(bus: ZenohBus, requests: list[CostRequest]) -> None:
         event.end()
 
     bus.serve(NAMELESS_COST, post, target="t0")
+    return requests
 
 
 def test_any_zenoh_session_gets_a_readable_answer(world):
-    requests: list[CostRequest] = []
-    serve_cost(world.bus("planner"), requests)
+    requests = serve_cost(world.bus("planner"))
     stranger = world.bus("stranger").session
     world.settle()
     replies = list(stranger.get("swarm/target/*/cost?row=4;col=5;format=json;key=target/*/cost", timeout=2.0))
@@ -182,8 +184,7 @@ def test_any_zenoh_session_gets_a_readable_answer(world):
 
 def test_a_query_for_everything_is_answered_and_harms_nobody(world):
     """`**` fits no template: the thread that serves must survive it."""
-    requests: list[CostRequest] = []
-    serve_cost(world.bus("planner"), requests)
+    requests = serve_cost(world.bus("planner"))
     stranger = world.bus("stranger").session
     world.settle()
     for expression in ("**", "swarm/**", "swarm/target/**/cost", "swarm/target/t0/cost"):
@@ -193,9 +194,8 @@ def test_a_query_for_everything_is_answered_and_harms_nobody(world):
 
 
 def test_a_bad_request_is_refused_in_words_and_counted(world):
-    requests: list[CostRequest] = []
     planner = world.bus("planner")
-    serve_cost(planner, requests)
+    requests = serve_cost(planner)
     stranger = world.bus("stranger").session
     world.settle()
     for selector, payload, complaint in (
@@ -263,9 +263,7 @@ def test_threads_that_post_replies_keep_what_python_knows_of_them(world):
 
 
 def test_garbage_is_logged_once_per_topic_whatever_its_keys(world, caplog):
-    a, b, box = world.bus("a"), world.bus("b"), Box()
-    b.subscribe(POSE, box)
-    world.settle()
+    a, b, _ = heard_by(world, POSE)
     for n in range(40):
         world.put_bytes(a, POSE, b"garbage", target=f"t{n}")
     world.until(lambda: b.counts["payloads_dropped"] == 40)
@@ -436,19 +434,13 @@ def test_a_question_longer_than_its_topic_allows_is_refused_before_it_waits(worl
     assert waiting == []
 
 
-class Deaf:
+class Deaf(Idle):
     """A service one of whose readers cannot post: `listen` says which."""
 
     def __init__(self, listen: Callable[[], None]) -> None:
-        self.counters = Counters()
+        super().__init__()
         self.stopped = False
         self.start = lambda now_ns: listen()
-
-    def handle(self, event: object, now_ns: int) -> None:
-        pass
-
-    def tick(self, now_ns: int) -> None:
-        pass
 
     def stop(self, now_ns: int) -> None:
         self.stopped = True
@@ -543,14 +535,7 @@ def test_what_is_said_again_under_another_key_or_to_another_question_does_not_co
 
 def test_a_person_asks_in_json_and_is_answered_in_json_or_told_what_is_wrong(world: ZenohWorld):
     a, b = world.bus("a"), world.bus("b")
-    heard = Box()
-
-    def answer(event):
-        heard.append(event)
-        event.answer(cost_reply([7.5]))
-        event.end()
-
-    a.serve(NAMELESS_COST, answer, target="t0")
+    requests = serve_cost(a)
     world.settle()
 
     def get(text: str):
@@ -559,8 +544,8 @@ def test_a_person_asks_in_json_and_is_answered_in_json_or_told_what_is_wrong(wor
         return reply
 
     reply = get('{"row": 4, "col": 2}')
-    assert json.loads(reply.ok.payload.to_bytes())["cost_to_go_s"] == [7.5]
-    assert heard[0].request == CostRequest(row=4, col=2)
+    assert json.loads(reply.ok.payload.to_bytes())["cost_to_go_s"] == [2.5, None]
+    assert requests == [CostRequest(row=4, col=2)]
     wrong = get('{"rwo": 4}').err.payload.to_string()
     assert wrong == "nameless-cost: unknown field 'rwo'; CostRequest has cells, row, col, vehicle_class"
     assert a.counts["payloads_dropped"] == 1

@@ -6,7 +6,6 @@ import pytest
 from launch_scripts.simulation.faults import random_plan
 from launch_scripts.simulation.sample_worlds import seeded
 from launch_scripts.simulation.simulate import Simulation
-from shared_map.cost_map import CostMap
 from shared_map.learning.learned_factors import name_of
 from swarm.config.scenario import Scenario
 
@@ -23,21 +22,17 @@ def scenario_of(seed: int) -> Scenario:
     )
 
 
-def maps_of(simulation: Simulation) -> dict[str, CostMap]:
-    services = {name: node.service for name, node in simulation.nodes.items()}
-    return {name: service._maps.common for name, service in services.items() if hasattr(service, "_maps")}
-
-
 @pytest.mark.thorough
 @pytest.mark.parametrize("seed", [1])
 def test_the_swarm_learns_what_its_prior_has_wrong_and_all_maps_agree(seed: int) -> None:
     scenario = scenario_of(seed)
     simulation = Simulation(scenario, faults=random_plan(scenario, seed, SECONDS))
     simulation.run_until(SECONDS + 10.0)
-    maps = maps_of(simulation)
+    services = [node.service for node in simulation.nodes.values()]
+    maps = [service._maps.common for service in services if hasattr(service, "_maps")]
     assert len(maps) >= 4
-    assert len({each.factors.tobytes() for each in maps.values()}) == 1
-    factors = next(iter(maps.values())).factors
+    assert len({each.factors.tobytes() for each in maps}) == 1
+    factors = maps[0].factors
     learned = {name_of(key): float(factors[key]) for key in range(66) if factors[key] != 1}
     assert any(name.startswith("grass") for name in learned)
     assert all(2.0 < factor < 4.0 for name, factor in learned.items() if name.startswith("grass"))

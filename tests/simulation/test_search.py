@@ -27,11 +27,11 @@ targets = [{ name = "h", count = 1, speed_m_per_s = 1, tracker = "sighted" }]
 groups = [{ vehicles = 3, start = "cluster" }]
 vehicles = { per_agent = 3, sense_range_m = 40, capture_range_m = 15 }
 """
+_OPEN = terrain_of_pace(np.full((60, 60), 0.3, np.float32), 10.0)
 
 
 def test_a_target_that_was_never_seen_is_searched_for_captured_and_searched_for_again() -> None:
-    scenario = parse_scenario(_SCENARIO)
-    simulation = Simulation(scenario, terrain=terrain_of_pace(np.full((60, 60), 0.3, np.float32), 10.0))
+    simulation = Simulation(parse_scenario(_SCENARIO), terrain=_OPEN)
     states: Counter[VehicleState] = Counter()
     apart = False
     searches = 0
@@ -51,11 +51,7 @@ def test_a_target_that_was_never_seen_is_searched_for_captured_and_searched_for_
 
 def test_a_planner_that_begins_anew_is_told_by_agents_where_its_target_was_last() -> None:
     blind = parse_scenario(_SCENARIO.replace("sense_range_m = 40", "sense_range_m = 0.5"))
-    simulation = Simulation(
-        blind,
-        faults=FaultPlan(crashes=(Crash(8.0, "planner-h"),)),
-        terrain=terrain_of_pace(np.full((60, 60), 0.3, np.float32), 10.0),
-    )
+    simulation = Simulation(blind, faults=FaultPlan(crashes=(Crash(8.0, "planner-h"),)), terrain=_OPEN)
     simulation.run_until(7.0)
     (agent,) = agents(simulation).values()
     now_ns = simulation.scheduler.clock.now_ns()

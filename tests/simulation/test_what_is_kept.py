@@ -12,9 +12,8 @@ import pytest
 from launch_scripts.simulation.faults import random_plan
 from launch_scripts.simulation.sample_worlds import SMALL, WIDE, crowd, seeded
 from launch_scripts.simulation.simulate import Simulation
-from shared_map.terrain.terrain import Terrain
 from swarm.config.agent_plan import agent_of
-from swarm.config.scenario import RoverConfig, Scenario
+from swarm.config.scenario import RoverConfig
 from swarm.right_of_way.cell_orders import Orders
 from swarm.right_of_way.shard_leader import Leader
 from swarm.wire.messages.traffic import Entry, Held, Number, Table
@@ -28,7 +27,7 @@ ROVERS = (
 SECONDS = 6.0
 
 
-def world(name: str, seed: int) -> tuple[Scenario, Terrain | None]:
+def simulation_of(name: str, seed: int, trace: io.StringIO | None = None, slower: float = 1.0) -> Simulation:
     """Agents that make marks all the time, three on one shard or more on many, or four in a crowd; among obstacles,
     or around targets that stay where they were caught."""
     kind, _, others = name.partition(" ")
@@ -36,13 +35,9 @@ def world(name: str, seed: int) -> tuple[Scenario, Terrain | None]:
     scenario, terrain = (seeded(seed, of_kind), None) if of_kind else crowd(kind, seed, 40, 10, side=16)
     if others == "parked":
         targets = tuple(msgspec.structs.replace(target, caught="stay") for target in scenario.targets)
-        return msgspec.structs.replace(scenario, targets=targets), terrain
-    return msgspec.structs.replace(scenario, rovers=ROVERS if others else ()), terrain
-
-
-def simulation_of(name: str, seed: int, trace: io.StringIO | None = None, slower: float = 1.0) -> Simulation:
-    scenario, terrain = world(name, seed)
-    scenario = msgspec.structs.replace(scenario, time_scale=scenario.time_scale / slower)
+        scenario = msgspec.structs.replace(scenario, targets=targets)
+    rovers = ROVERS if others == "among rovers" else ()
+    scenario = msgspec.structs.replace(scenario, rovers=rovers, time_scale=scenario.time_scale / slower)
     faults = random_plan(scenario, seed, SECONDS)
     return Simulation(scenario, faults=faults, terrain=terrain, trace=trace)
 

@@ -4,7 +4,7 @@
 from __future__ import annotations
 
 import pytest
-from support.bus_world import Box, World, answering, asked, marks, note, pose
+from support.bus_world import Box, World, answering, asked, heard_by, marks, note, pose, waiting
 from support.makers import run_info
 
 from shared_map.replication.marks import packed
@@ -21,10 +21,7 @@ from swarm.wire.topics import MARKS, NOTE, RUN, STORED, TRUE_POSE
 
 
 def test_a_subscriber_hears_the_message_and_the_fields_of_its_key(world: World):
-    a, b = world.bus("a"), world.bus("b")
-    box = Box()
-    b.subscribe(TRUE_POSE, box)
-    world.settle()
+    a, b, box = heard_by(world, TRUE_POSE)
     a.publish(TRUE_POSE, pose(), target="t0")
     world.until(lambda: box)
     assert box == [Heard(TRUE_POSE, {"target": "t0"}, pose())]
@@ -57,10 +54,7 @@ def test_a_process_does_not_hear_itself_where_the_topic_says_so(world: World):
 
 
 def test_samples_that_wait_are_heard_together_in_order_with_their_keys_and_without_garbage(world: World):
-    a, b = world.bus("a"), world.bus("b")
-    box = Box()
-    b.subscribe(MARKS, box, together=True)
-    world.settle()
+    a, b, box = heard_by(world, MARKS, together=True)
     sent = [marks("a0.1", tile) for tile in range(40)]
     for each in sent:
         a.publish(MARKS, each, region=0, tile=each.tile, author="a0.1")
@@ -73,10 +67,8 @@ def test_samples_that_wait_are_heard_together_in_order_with_their_keys_and_witho
 
 
 def test_what_is_collected_waits_and_of_each_key_the_newest_is_left(world: World):
-    a, b = world.bus("a"), world.bus("b")
+    a, b, box = heard_by(world, TRUE_POSE)
     b.collect(TRUE_POSE)
-    box = Box()
-    b.subscribe(TRUE_POSE, box)
     world.settle()
     for seq in range(5):
         for target in ("t0", "t1"):
@@ -98,9 +90,7 @@ def test_what_is_collected_waits_and_of_each_key_the_newest_is_left(world: World
 
 
 def test_what_is_collected_together_is_all_that_came_in_order_without_garbage(world: World):
-    a, b = world.bus("a"), world.bus("b")
-    box = Box()
-    b.subscribe(MARKS, box, together=True)
+    a, b, box = heard_by(world, MARKS, together=True)
     b.collect(MARKS, region=0)
     b.collect(MARKS, region=1)
     world.settle()
@@ -129,10 +119,8 @@ def test_what_is_collected_together_is_all_that_came_in_order_without_garbage(wo
 
 
 def test_what_is_collected_is_bounded_and_ends_with_its_subscription(world: World):
-    a, b = world.bus("a"), world.bus("b")
+    a, b, box = heard_by(world, NOTE)
     b.collect(NOTE)
-    box = Box()
-    b.subscribe(NOTE, box)
     world.settle()
     for n in range(NOTE.buffer + 50):
         a.publish(NOTE, note(f"n{n}"), role="agent", id="a0")
@@ -152,9 +140,7 @@ def test_what_is_collected_is_bounded_and_ends_with_its_subscription(world: Worl
 
 
 def test_a_slow_reader_gets_the_newest_of_each_key_at_its_own_pace(world: World):
-    a, b, box = world.bus("a"), world.bus("b"), Box()
-    b.subscribe(TRUE_POSE, box, every_s=0.5)
-    world.settle()
+    a, b, box = heard_by(world, TRUE_POSE, every_s=0.5)
     for seq in range(1, 21):
         for target in ("t0", "t1"):
             a.publish(TRUE_POSE, pose(target, seq=seq), target=target)
@@ -232,9 +218,7 @@ def test_what_is_served_no_more_is_not_asked_and_may_be_served_again(world: Worl
 
 
 def test_samples_of_one_sender_come_in_order(world: World):
-    a, b, box = world.bus("a"), world.bus("b"), Box()
-    b.subscribe(TRUE_POSE, box)
-    world.settle()
+    a, _, box = heard_by(world, TRUE_POSE)
     for seq in range(200):
         a.publish(TRUE_POSE, pose(seq=seq), target="t0")
     world.until(lambda: len(box) == 200)
@@ -259,9 +243,7 @@ def test_two_namespaces_do_not_hear_each_other(world: World):
 
 
 def test_garbage_is_counted_and_dropped_and_what_follows_is_heard(world: World):
-    a, b, box = world.bus("a"), world.bus("b"), Box()
-    b.subscribe(TRUE_POSE, box)
-    world.settle()
+    a, b, box = heard_by(world, TRUE_POSE)
     for payload in (b"", b"\xc1", b"garbage", b"\x81\xa6schema\xa6pose/9"):
         world.put_bytes(a, TRUE_POSE, payload, target="t0")
     a.publish(TRUE_POSE, pose(), target="t0")
@@ -271,9 +253,7 @@ def test_garbage_is_counted_and_dropped_and_what_follows_is_heard(world: World):
 
 
 def test_what_says_that_it_is_anothers_than_its_key_says_is_dropped(world: World):
-    a, b, box = world.bus("a"), world.bus("b"), Box()
-    b.subscribe(TRUE_POSE, box)
-    world.settle()
+    a, b, box = heard_by(world, TRUE_POSE)
     a.publish(TRUE_POSE, pose("t1"), target="t0")
     a.publish(TRUE_POSE, pose("t0"), target="t0")
     world.until(lambda: box)
@@ -368,11 +348,7 @@ def test_after_close_nothing_is_sent_heard_or_raised(world: World):
 
 
 def test_a_query_to_one_that_closes_ends(world: World):
-    a, b, kept, box = world.bus("a"), world.bus("b"), Box(), Box()
-    b.serve(RUN, kept, role="agent", id="b")
-    world.settle()
-    a.ask(RUN, Nothing(), box, tag="q", timeout_s=1.0)
-    world.until(lambda: kept)
+    _, b, _, box = waiting(world, timeout_s=1.0)
     b.close()
     world.until(lambda: box)
     assert len(box) == 1

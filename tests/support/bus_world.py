@@ -6,10 +6,11 @@ from collections.abc import Callable
 from typing import Any, Protocol
 
 from swarm.bus.bus import Asked, AskEnded, Bus, Event, Replied
+from swarm.wire.messages import Nothing
 from swarm.wire.messages.map_data import MarkSet
 from swarm.wire.messages.planning import TargetPose
 from swarm.wire.messages.processes import Note
-from swarm.wire.topics import Topic
+from swarm.wire.topics import RUN, Topic
 
 
 class World(Protocol):
@@ -50,6 +51,24 @@ def marks(author: str, tile: int) -> MarkSet:
     return MarkSet(
         author=author, group="all", tile=tile, epoch=1, seq=1, cells=b"", kinds=b"", paces=b"", stamps_ns=b""
     )
+
+
+def heard_by(world: World, topic: Topic, **options: Any) -> tuple[Bus, Bus, Box]:
+    """Two buses, and what the second hears on a topic."""
+    a, b, box = world.bus("a"), world.bus("b"), Box()
+    b.subscribe(topic, box, **options)
+    world.settle()
+    return a, b, box
+
+
+def waiting(world: World, **options: Any) -> tuple[Bus, Bus, Asked, Box]:
+    """Two buses, a question of the first that waits for the answer of the second, and what the first hears."""
+    a, b, kept, box = world.bus("a"), world.bus("b"), Box(), Box()
+    b.serve(RUN, kept, role="agent", id="b")
+    world.settle()
+    a.ask(RUN, Nothing(), box, tag="q", **options)
+    world.until(lambda: kept)
+    return a, b, kept[0], box
 
 
 def answering(*replies: Any) -> Callable[[Event], None]:

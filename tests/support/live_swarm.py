@@ -28,7 +28,7 @@ from swarm.wire.topics import ROUTE, RUN, Topic
 
 SWARM = [sys.executable, "-c", "import sys; from launch_scripts.cli import main; sys.exit(main())"]
 
-SMALL_WORLD = """
+SMALL_TERRAIN = """
 [terrain]
 source = "synthetic"
 rows = 96
@@ -36,7 +36,8 @@ cols = 128
 resolution_m = 30
 relief_m = 300
 roads = 4
-
+"""
+SMALL_WORLD = f"""{SMALL_TERRAIN}
 [terrain.hidden]
 rubble_fields = 5
 

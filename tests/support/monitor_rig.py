@@ -25,17 +25,9 @@ from swarm.wire.messages import Message
 from swarm.wire.messages.map_data import MarkSet
 
 _TOPICS = (
-    *(
-        topics.BELIEVED,
-        topics.OBSTACLE,
-        topics.FLEET,
-        topics.FOLLOWED,
-        topics.GOAL_STATES,
-        topics.MARKS,
-        topics.NOTE,
-    ),
-    *(topics.POSE, topics.SIGHTED, topics.STATS, topics.STATUS),
-)
+    topics.BELIEVED, topics.OBSTACLE, topics.FLEET, topics.FOLLOWED, topics.GOAL_STATES, topics.MARKS, topics.NOTE,
+    topics.POSE, topics.SIGHTED, topics.STATS, topics.STATUS,
+)  # fmt: skip
 SILENT = MonitorConfig(live=False)
 LIVE = MonitorConfig(live=True, web_port=0)
 NOBODY, SOMEBODY = Audience(now=0, ever=0), Audience(now=1, ever=1)

@@ -39,11 +39,11 @@ def flat() -> NDArray[np.float32]:
     return np.full((ROWS, COLS), 0.1, np.float32)
 
 
-def rough(seed: int, lethal: float = 0.2) -> NDArray[np.float32]:
+def rough(seed: int, lethal: float = 0.2, rows: int = ROWS, cols: int = COLS) -> NDArray[np.float32]:
     rng = np.random.default_rng(seed)
-    pace = rng.uniform(0.05, 0.6, (ROWS, COLS)).astype(np.float32)
-    pace[rng.random((ROWS, COLS)) < lethal] = np.inf
-    pace[ROWS // 2] = 0.1
+    pace = rng.uniform(0.05, 0.6, (rows, cols)).astype(np.float32)
+    pace[rng.random((rows, cols)) < lethal] = np.inf
+    pace[rows // 2] = 0.1
     return pace
 
 
@@ -60,15 +60,15 @@ def driven_s(pace: NDArray[np.float32], route: Route) -> float:
 
 
 class Ear:
-    """A client that asks, and hears everything."""
+    """A client that asks, and hears everything on some topics."""
 
-    def __init__(self, world: SwarmModel) -> None:
+    def __init__(self, world: SwarmModel, topics: tuple[Topic, ...] = (PUSHED_ROUTE, STATUS, STATS)) -> None:
         self.world = world
         self.bus = world.bus("ear")
         self.heard: list[Message] = []
         self.replies: list[Message] = []
         self.ended: list[AskEnded] = []
-        for topic in (PUSHED_ROUTE, STATUS, STATS):
+        for topic in topics:
             self.bus.subscribe(topic, self._post)
 
     def _post(self, event: Event) -> None:

@@ -244,23 +244,9 @@ def test_slow_connections_are_cut_before_old_ones_and_readers_before_probes(asks
 
 
 PARTS = (
-    "127.0.0.1",
-    "localhost",
-    "LOCALHOST",
-    "[::1]",
-    "::1",
-    "evil.com",
-    ".",
-    "@",
-    ":",
-    ":80",
-    "%00",
-    "/",
-    "#",
-    "?",
-    " ",
-    "\\",
-)
+    "127.0.0.1", "localhost", "LOCALHOST", "[::1]", "::1", "evil.com", ".", "@", ":", ":80", "%00", "/", "#", "?",
+    " ", "\\",
+)  # fmt: skip
 OURS = ("127.0.0.1", "localhost", "[::1]")
 
 

@@ -27,6 +27,12 @@ READ = "/rerun.sdk_comms.v1alpha1.MessageProxyService/ReadMessages"
 GRPC_WEB = {"Content-Type": "application/grpc-web+proto", "X-Grpc-Web": "1"}
 
 
+def taking(host: str = "localhost") -> bytes:
+    """A request for the stream."""
+    head = f"POST {READ} HTTP/1.1\r\nHost: {host}\r\nContent-Type: application/grpc-web+proto\r\n"
+    return head.encode() + b"Content-Length: 5\r\n\r\n" + bytes(5)
+
+
 @pytest.fixture(scope="module")
 def sinks() -> Iterator[Sinks]:
     mesh = TerrainMesh(terrain_of_pace(np.ones((8, 8), np.float32)))
@@ -41,7 +47,7 @@ def ask(port: int, method: str, path: str, headers: dict[str, str], body: bytes 
     with contextlib.closing(connection):
         connection.putrequest(method, path, skip_host="Host" in headers)
         for name, value in headers.items():
-            connection.putheader(name, value)
+            connection.putheader(name, value.format(port=port))
         connection.putheader("Content-Length", str(len(body)))
         connection.endheaders(body)
         reply = connection.getresponse()
@@ -65,11 +71,10 @@ OWN = [
 @pytest.mark.parametrize("headers", FOREIGN, ids=str)
 def test_pages_of_other_sites_are_refused(sinks: Sinks, headers: dict[str, str]) -> None:
     page = sinks.web_port
-    filled = {name: value.format(port=page) for name, value in headers.items()}
-    assert ask(page, "GET", "/", filled)[0] == 403
-    assert ask(page, "GET", "/run.json", filled)[0] == 403
+    assert ask(page, "GET", "/", headers)[0] == 403
+    assert ask(page, "GET", "/run.json", headers)[0] == 403
     for method in ("POST", "OPTIONS", "GET"):
-        status, body = ask(page, method, READ, {**GRPC_WEB, **filled}, bytes(5))
+        status, body = ask(page, method, READ, {**GRPC_WEB, **headers}, bytes(5))
         assert status == 403
         assert b"where everybody is" not in body
 
@@ -77,17 +82,15 @@ def test_pages_of_other_sites_are_refused(sinks: Sinks, headers: dict[str, str])
 @pytest.mark.parametrize("headers", OWN, ids=str)
 def test_pages_of_this_machine_come_in_through_tunnels_too(sinks: Sinks, headers: dict[str, str]) -> None:
     page = sinks.web_port
-    filled = {name: value.format(port=page) for name, value in headers.items()}
-    assert ask(page, "GET", "/", filled)[0] == 200
-    status, body = ask(page, "POST", READ, {**GRPC_WEB, **filled}, bytes(5))
+    assert ask(page, "GET", "/", headers)[0] == 200
+    status, body = ask(page, "POST", READ, {**GRPC_WEB, **headers}, bytes(5))
     assert (status, len(body) > 50) == (200, True), "the stream comes through the page's port"
 
 
 def test_a_second_request_on_a_connection_does_not_slip_in_behind_the_first(sinks: Sinks) -> None:
     own = f"POST {READ} HTTP/1.1\r\nHost: localhost\r\nContent-Length: 5\r\n\r\n".encode() + bytes(5)
-    foreign = f"POST {READ} HTTP/1.1\r\nHost: evil.example\r\nContent-Type: application/grpc-web+proto\r\n"
     with socket.create_connection(("127.0.0.1", sinks.web_port), timeout=10) as both:
-        both.sendall(own + foreign.encode() + b"Content-Length: 5\r\n\r\n" + bytes(5))
+        both.sendall(own + taking("evil.example"))
         told = b""
         with contextlib.suppress(ConnectionError):
             while piece := both.recv(4096):
@@ -115,11 +118,10 @@ def test_connections_are_bounded_and_the_idle_ones_cut(sinks: Sinks, monkeypatch
 def test_a_reader_that_takes_nothing_is_cut_off(sinks: Sinks, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(web, "SEND_WITHIN_S", 1.0)
     before = threading.active_count()
-    head = f"POST {READ} HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/grpc-web+proto\r\n"
     with socket.socket() as slow:
         slow.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 4096)
         slow.connect(("127.0.0.1", sinks.web_port))
-        slow.sendall(head.encode() + b"Content-Length: 5\r\n\r\n" + bytes(5))
+        slow.sendall(taking())
         for _ in range(60):
             sinks.rec.log("noise", rr.Image(np.random.default_rng(1).integers(0, 255, (400, 400, 3), np.uint8)))
         sinks.rec.flush(timeout_sec=10)
@@ -142,11 +144,10 @@ def test_who_takes_the_stream_looks_and_who_only_knocks_does_not(sinks: Sinks) -
     ask(page, "POST", READ, {"Host": "evil.example", **GRPC_WEB})
     ask(page, "GET", "/", {})
     assert sinks.audience() == before
-    head = f"POST {READ} HTTP/1.1\r\nHost: localhost\r\nContent-Type: application/grpc-web+proto\r\n"
     with contextlib.ExitStack() as stack:
         for _ in range(2):
             viewer = stack.enter_context(socket.create_connection(("127.0.0.1", page), timeout=5))
-            viewer.sendall(head.encode() + b"Content-Length: 5\r\n\r\n" + bytes(5))
+            viewer.sendall(taking())
             assert viewer.recv(4) == b"HTTP"
         eventually(lambda: sinks.audience() == Audience(now=2, ever=before.ever + 2), 10, "both have taken it")
     eventually(lambda: sinks.audience().now == 0, 30, "both are gone")

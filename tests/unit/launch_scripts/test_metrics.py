@@ -21,7 +21,6 @@ from launch_scripts.observe.summed_counts import Counts
 from launch_scripts.web.prometheus import HELP, MetricsEndpoint, Run, families, named
 from swarm.clock import NS_PER_S
 from swarm.runtime.stats import CAPTURES_OF, GAPS_TO, Counters
-from swarm.wire.messages.planning import PlannerStatus
 from swarm.wire.messages.processes import Stats
 
 _BEGAN_NS = 1_790_000_000 * NS_PER_S
@@ -31,32 +30,24 @@ def _stats(role: str, id: str, counters: Counters, generation: int = _BEGAN_NS) 
     return stats(role, id, counters, incarnation=generation, stamp_ns=generation + NS_PER_S)
 
 
-def _status(target: str) -> PlannerStatus:
-    return planner_status(
-        target, stamp_ns=_BEGAN_NS, tree_age_ms=250.0, growths=2, window_growths=3, growth_ms=4.0, routes_served=5,
-        following=7, pose_age_s=0.5, tracker_lost=True,
-    )  # fmt: skip
-
-
-def _agent() -> Counters:
-    counters = Counters()
-    counters.count("messages_out", 40)
-    counters.count("ticks_late", 3)
-    counters.gauge("vehicles_following", 6)
-    for ms in (1.0, 3.0, 40.0, 20_000.0):
-        counters.observe("route_query_ms", ms)
-    counters.observe_by(GAPS_TO, "t0", 0.03)
-    return counters
-
-
 @pytest.fixture
 def figures() -> list[Metric]:
-    counts, targets = Counts(), Counters()
+    counts, agent, targets = Counts(), Counters(), Counters()
+    agent.count("messages_out", 40)
+    agent.count("ticks_late", 3)
+    agent.gauge("vehicles_following", 6)
+    for ms in (1.0, 3.0, 40.0, 20_000.0):
+        agent.observe("route_query_ms", ms)
+    agent.observe_by(GAPS_TO, "t0", 0.03)
     targets.count("captures", 2)
     targets.count_by(CAPTURES_OF, "t0")
-    counts.count(_stats("agent", "a0", _agent()))
+    counts.count(_stats("agent", "a0", agent))
     counts.count(_stats("targets", "0", targets))
-    return families(Run("r1", "demo", _BEGAN_NS), counts, {"t0": _status("t0")}, [("agent", "a0")])
+    status = planner_status(
+        "t0", stamp_ns=_BEGAN_NS, tree_age_ms=250.0, growths=2, window_growths=3, growth_ms=4.0, routes_served=5,
+        following=7, pose_age_s=0.5, tracker_lost=True,
+    )  # fmt: skip
+    return families(Run("r1", "demo", _BEGAN_NS), counts, {"t0": status}, [("agent", "a0")])
 
 
 def _scraped(

@@ -23,7 +23,6 @@ from launch_scripts import parent_death
 from launch_scripts.monitor.live_layout import make_blueprint
 from launch_scripts.monitor.rerun_outputs import Sinks, new_recording_path
 from launch_scripts.monitor.terrain_mesh import TerrainMesh
-from shared_map.terrain.terrain import Terrain
 from swarm.bus.bus import Event, Heard
 from swarm.clock import NS_PER_S
 from swarm.config.scenario import MonitorConfig, Scenario
@@ -36,15 +35,7 @@ from swarm.wire.messages.processes import Stats
 from swarm.wire.messages.vehicles import Followed, Obstacle
 from swarm.wire.topics import FOLLOWED, STATS, TOPICS
 
-
-@pytest.fixture(scope="module")
-def scenario() -> Scenario:
-    return little_scenario()
-
-
-@pytest.fixture(scope="module")
-def terrain() -> Terrain:
-    return little_terrain()
+SCENARIO, TERRAIN = little_scenario(), little_terrain()
 
 
 def chunks(path: Path) -> list[Any]:
@@ -70,16 +61,16 @@ def still_entities(path: Path) -> set[str]:
     return {str(chunk.entity_path) for chunk in chunks(path) if chunk.is_static}
 
 
-def recorded(scenario: Scenario, terrain: Terrain, tmp_path: Path) -> tuple[Path, Rig]:
+def recorded(tmp_path: Path, scenario: Scenario = SCENARIO) -> tuple[Path, Rig]:
     """The recording of a run, and what made it."""
-    rig = Rig(scenario, terrain, new_recording_path(tmp_path))
-    rig.play(fake_run(terrain, hidden_truth(terrain), scenario))
+    rig = Rig(scenario, TERRAIN, new_recording_path(tmp_path))
+    rig.play(fake_run(TERRAIN, hidden_truth(TERRAIN), scenario))
     rig.close()
     return tmp_path / "run.rrd", rig
 
 
-def test_a_recording_holds_all_that_is_to_be_seen(scenario: Scenario, terrain: Terrain, tmp_path: Path) -> None:
-    _, rig = recorded(scenario, terrain, tmp_path)
+def test_a_recording_holds_all_that_is_to_be_seen(tmp_path: Path) -> None:
+    _, rig = recorded(tmp_path)
     tiles = rig.mesh.tiles
     rows = rows_by_entity(tmp_path / "run.rrd")
     assert rows["/world/vehicles"] >= 11
@@ -112,11 +103,9 @@ def components(path: Path, entity: str, since_s: float = 0.0) -> dict[str, list[
     return {name: rows for name, rows in found.items() if rows}
 
 
-def test_an_instance_has_three_components_of_which_one_says_who_it_is(
-    scenario: Scenario, terrain: Terrain, tmp_path: Path
-) -> None:
+def test_an_instance_has_three_components_of_which_one_says_who_it_is(tmp_path: Path) -> None:
     """With more than three, the viewer shows only their number at the pointer."""
-    recorded(scenario, terrain, tmp_path)
+    recorded(tmp_path)
     for entity, sentence in (("/world/vehicles", "vehicle"), ("/world/targets/balls", "target")):
         parts = components(tmp_path / "run.rrd", entity)
         parts = {name: rows for name, rows in parts.items() if not name.endswith("RowId")}
@@ -127,11 +116,11 @@ def test_an_instance_has_three_components_of_which_one_says_who_it_is(
     )
 
 
-def test_who_opens_the_view_late_has_all_of_it_soon(scenario: Scenario, terrain: Terrain, tmp_path: Path) -> None:
+def test_who_opens_the_view_late_has_all_of_it_soon(tmp_path: Path) -> None:
     """The server may have dropped old data: the drawings after a viewer came hold every component."""
-    longer = msgspec.structs.replace(scenario, seconds=16.0)
-    rig = Rig(longer, terrain, tmp_path / "run.rrd", audience=NOBODY)
-    told = list(fake_run(terrain, hidden_truth(terrain), longer))
+    longer = msgspec.structs.replace(SCENARIO, seconds=16.0)
+    rig = Rig(longer, TERRAIN, tmp_path / "run.rrd", audience=NOBODY)
+    told = list(fake_run(TERRAIN, hidden_truth(TERRAIN), longer))
     rig.play(each for each in told if each[0] < 11 * NS_PER_S)
     came_s = rig.service.at_s
     rig.audience = SOMEBODY
@@ -143,12 +132,10 @@ def test_who_opens_the_view_late_has_all_of_it_soon(scenario: Scenario, terrain:
         assert whole == late, entity
 
 
-def test_while_nobody_looks_half_the_frames_are_drawn_and_packed_together(
-    scenario: Scenario, terrain: Terrain, tmp_path: Path
-) -> None:
+def test_while_nobody_looks_half_the_frames_are_drawn_and_packed_together(tmp_path: Path) -> None:
     frames, packs = {}, {}
     for name, audience in (("seen", SOMEBODY), ("unseen", NOBODY)):
-        rig = Rig(scenario, terrain, tmp_path / name, audience=audience)
+        rig = Rig(SCENARIO, TERRAIN, tmp_path / name, audience=audience)
         rig.play(
             (tick * NS_PER_S // 10, fleet(20.0 * tick, ("a0-00", 0), at_m=(tick, 0.0))) for tick in range(1, 41)
         )
@@ -161,9 +148,9 @@ def test_while_nobody_looks_half_the_frames_are_drawn_and_packed_together(
 
 
 @pytest.mark.parametrize("name", ["a0-03", "t1"])
-def test_the_camera_follows_who_is_named(scenario: Scenario, terrain: Terrain, tmp_path: Path, name: str) -> None:
-    following = msgspec.structs.replace(scenario, monitor=MonitorConfig(live=False, follow=name))
-    recorded(following, terrain, tmp_path)
+def test_the_camera_follows_who_is_named(tmp_path: Path, name: str) -> None:
+    following = msgspec.structs.replace(SCENARIO, monitor=MonitorConfig(live=False, follow=name))
+    recorded(tmp_path, following)
     led = [tuple(row[0]) for row in components(tmp_path / "run.rrd", "/world/followed")["translation"]]
     assert len(set(led)) > 2, "it moves"
 
@@ -206,11 +193,9 @@ DRAWN_AND_TAKEN_AWAY: dict[str, tuple[list[tuple[int, Any]], str, str, list[int]
 
 
 @pytest.mark.parametrize("what", DRAWN_AND_TAKEN_AWAY)
-def test_what_is_told_is_drawn_when_it_changes_and_taken_away_when_it_is_over(
-    scenario: Scenario, terrain: Terrain, tmp_path: Path, what: str
-) -> None:
+def test_what_is_told_is_drawn_when_it_changes_and_taken_away_when_it_is_over(tmp_path: Path, what: str) -> None:
     told, entity, component, instances = DRAWN_AND_TAKEN_AWAY[what]
-    rig = Rig(scenario, terrain, tmp_path / "run.rrd")
+    rig = Rig(SCENARIO, TERRAIN, tmp_path / "run.rrd")
     rig.play(told)
     rig.run(8)
     rig.close()
@@ -222,10 +207,8 @@ def test_no_recording_replaces_another(tmp_path: Path) -> None:
     assert [new_recording_path(tmp_path).name for _ in range(3)] == ["run.rrd", "run-2.rrd", "run-3.rrd"]
 
 
-def test_a_route_that_leaves_the_map_is_counted_and_not_drawn(
-    scenario: Scenario, terrain: Terrain, tmp_path: Path
-) -> None:
-    rig = Rig(scenario, terrain, None)
+def test_a_route_that_leaves_the_map_is_counted_and_not_drawn() -> None:
+    rig = Rig(SCENARIO, TERRAIN, None)
     rig.speaker.publish(
         FOLLOWED,
         Followed(vehicle="v", target="t0", start=0, directions=b"\x00", cost_s=1.0, lower_bound_s=1.0),
@@ -237,8 +220,8 @@ def test_a_route_that_leaves_the_map_is_counted_and_not_drawn(
     rig.close()
 
 
-def test_where_to_watch_is_told_to_whoever_begins_to_listen_later(scenario: Scenario, terrain: Terrain) -> None:
-    rig = Rig(scenario, terrain, None, web_port=9090)
+def test_where_to_watch_is_told_to_whoever_begins_to_listen_later() -> None:
+    rig = Rig(SCENARIO, TERRAIN, None, web_port=9090)
     rig.run(30)
     heard: list[Event] = []
     rig.speaker.subscribe(STATS, heard.append)
@@ -248,10 +231,8 @@ def test_where_to_watch_is_told_to_whoever_begins_to_listen_later(scenario: Scen
     assert [stats.web_port for stats in told if isinstance(stats, Stats) and stats.role == "monitor"][:1] == [9090]
 
 
-def test_who_comes_and_who_goes_is_in_the_log_and_who_was_there_is_not(
-    scenario: Scenario, terrain: Terrain
-) -> None:
-    rig = Rig(scenario, terrain, None)
+def test_who_comes_and_who_goes_is_in_the_log_and_who_was_there_is_not() -> None:
+    rig = Rig(SCENARIO, TERRAIN, None)
     told: list[str] = []
     rig.service._panel.note = lambda text, level: told.append(text)  # type: ignore[method-assign]
     rig.bus("early").declare_alive(Peer("agent", "a0", 7))
@@ -265,11 +246,11 @@ def test_who_comes_and_who_goes_is_in_the_log_and_who_was_there_is_not(
     assert told == ["agent a1 is up", "agent a1 is gone"]
 
 
-def test_a_monitor_speaks_of_nothing_but_itself(scenario: Scenario, terrain: Terrain) -> None:
-    rig = Rig(scenario, terrain, None)
+def test_a_monitor_speaks_of_nothing_but_itself() -> None:
+    rig = Rig(SCENARIO, TERRAIN, None)
     for topic in TOPICS:
         rig.speaker.subscribe(topic, lambda _: None)
-    rig.play(fake_run(terrain, hidden_truth(terrain), msgspec.structs.replace(scenario, seconds=2.0)))
+    rig.play(fake_run(TERRAIN, hidden_truth(TERRAIN), msgspec.structs.replace(SCENARIO, seconds=2.0)))
     rig.close()
     assert rig.said == {"run", "stats"}
 
@@ -284,8 +265,8 @@ def listeners() -> set[str]:
 
 
 @pytest.mark.network
-def test_page_and_stream_are_served_on_loopback_only_and_cannot_call_home(terrain: Terrain, tmp_path: Path) -> None:
-    sinks = Sinks("r", tmp_path / "run.rrd", LIVE, make_blueprint(TerrainMesh(terrain)))
+def test_page_and_stream_are_served_on_loopback_only_and_cannot_call_home(tmp_path: Path) -> None:
+    sinks = Sinks("r", tmp_path / "run.rrd", LIVE, make_blueprint(TerrainMesh(TERRAIN)))
     url = sinks.page.server.url
     try:
         with urllib.request.urlopen(url, timeout=30) as reply:
@@ -343,10 +324,8 @@ sinks.close()
     assert rows_by_entity(tmp_path / "run-2.rrd")["/a"] == 4
 
 
-def test_a_recording_that_begins_anew_holds_all_that_does_not_move(
-    scenario: Scenario, terrain: Terrain, tmp_path: Path
-) -> None:
-    rig = Rig(scenario, terrain, tmp_path / "run.rrd")
+def test_a_recording_that_begins_anew_holds_all_that_does_not_move(tmp_path: Path) -> None:
+    rig = Rig(SCENARIO, TERRAIN, tmp_path / "run.rrd")
     told = iter([None, tmp_path / "run-2.rrd"])
     rig.service._recording = lambda now_ns: next(told, None)
     rig.run(0.15)
@@ -374,7 +353,7 @@ time.sleep(60)
 
 
 @pytest.mark.network
-def test_a_taken_port_is_one_clear_sentence(terrain: Terrain, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_taken_port_is_one_clear_sentence(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("launch_scripts.web.live_page.PORT_PATIENCE_S", 0.2)
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
@@ -382,4 +361,4 @@ def test_a_taken_port_is_one_clear_sentence(terrain: Terrain, monkeypatch: pytes
         with pytest.raises(
             BusError, match=rf"monitor\.web_port {port} cannot be opened: Address already in use; choose another"
         ):
-            Sinks("r", None, config, make_blueprint(TerrainMesh(terrain)))
+            Sinks("r", None, config, make_blueprint(TerrainMesh(TERRAIN)))

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from support.makers import target_pose
+from support.planner_swarm import Ear
 from support.swarm_model import SwarmModel
 from support.target_reports import RES, flat, fleet
 
@@ -26,7 +27,6 @@ from launch_scripts.simulation.world.walks import Walk
 from shared_map.keeper.mark_store import KeeperStore
 from shared_map.terrain.store import homes_of
 from shared_map.terrain.terrain import terrain_of_pace
-from swarm.bus.bus import Event, Heard
 from swarm.clock import NS_PER_S
 from swarm.config.scenario import Scenario, TargetConfig, VehicleConfig
 from swarm.wire.codec import decode, encode
@@ -304,27 +304,10 @@ def test_a_pose_is_told_when_the_target_has_moved_or_was_caught_and_else_twice_a
 def targets_on(pace: NDArray[np.float32], plan: Scenario, **said: Any) -> tuple[SwarmModel, Ear]:
     """A swarm of nothing but targets, and what it says."""
     model = SwarmModel(terrain=terrain_of_pace(pace, RES), scenario=plan)
-    ear = Ear(model)
+    ear = Ear(model, (POSE, NOTE, STATS))
     setup = replace(model.setup("targets", "0"), **said)
     model.start("targets", lambda bus, post: TargetsService(setup, model.terrain, pace, bus, post), phase_ns=0)
     return model, ear
-
-
-class Ear:
-    """Hears everything that is published on some topics."""
-
-    def __init__(self, world: SwarmModel) -> None:
-        self.bus = world.bus("ear")
-        self.heard: list[Any] = []
-        for topic in (POSE, NOTE, STATS):
-            self.bus.subscribe(topic, self._post)
-
-    def _post(self, event: Event) -> None:
-        assert isinstance(event, Heard)
-        self.heard.append(event.message)
-
-    def of(self, kind: type[Any]) -> list[Any]:
-        return [message for message in self.heard if isinstance(message, kind)]
 
 
 def test_the_service_tells_poses_captures_and_broken_laws() -> None:

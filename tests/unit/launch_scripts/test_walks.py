@@ -12,6 +12,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from support import slow_twins as naive
+from support.planner_swarm import rough
 from support.target_reports import RES, flat
 
 from launch_scripts.process_table import processes_of
@@ -45,14 +46,6 @@ def terrain(pace: NDArray[np.float32]) -> TrueTerrain:
     return TrueTerrain(GridSpec(rows, cols, RES), pace)
 
 
-def rough(seed: int, rows: int = 30, cols: int = 34, lethal: float = 0.3) -> NDArray[np.float32]:
-    rng = np.random.default_rng(seed)
-    pace = rng.uniform(0.05, 0.5, (rows, cols)).astype(np.float32)
-    pace[rng.random((rows, cols)) < lethal] = np.inf
-    pace[rows // 2] = 0.1
-    return pace
-
-
 def walker(
     where: TrueTerrain,
     cell: int,
@@ -73,7 +66,7 @@ def test_no_target_takes_a_step_that_is_too_steep_and_none_outruns_the_climb(wal
         GridSpec(30, 34, RES), heights, CostConfig(directional=True, max_climb_deg=20, max_slope_deg=50)
     )
     assert climb is not None
-    where = TrueTerrain(GridSpec(30, 34, RES), rough(3, lethal=0.1), climb)
+    where = TrueTerrain(GridSpec(30, 34, RES), rough(3, 0.1, 30, 34), climb)
     one = walker(where, where.nearest(29 * 34 + 15), walk)
     downhill = 0
     for _ in range(1500):
@@ -115,7 +108,7 @@ def test_a_terrain_without_a_passable_cell_is_refused() -> None:
 @settings(deadline=None, max_examples=25)
 @given(st.integers(0, 10_000), st.sampled_from(["random", "waypoints", "evade"]))
 def test_every_step_of_every_walk_is_legal(seed: int, walk: Walk) -> None:
-    where = terrain(rough(seed))
+    where = terrain(rough(seed, 0.3, 30, 34))
     one = walker(where, where.random_home(random.Random(seed)), walk, seed=seed)
     vehicles = where.home[:3]
     for _ in range(80):
@@ -131,7 +124,7 @@ def test_every_step_of_every_walk_is_legal(seed: int, walk: Walk) -> None:
 @settings(deadline=None, max_examples=20)
 @given(st.integers(0, 10_000))
 def test_a_way_is_the_cheapest_there_is(seed: int) -> None:
-    where = terrain(rough(seed, 12, 14))
+    where = terrain(rough(seed, 0.3, 12, 14))
     start = where.random_home(random.Random(seed))
     way = where.way(start, random.Random(seed))
     cost, at = 0.0, start
