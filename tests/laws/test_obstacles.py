@@ -9,13 +9,12 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from support.effort import few
-from support.shard_tables import grants_of
+from support.shard_tables import grants_of, holdings_of
 
 from swarm.clock import NS_PER_S
 from swarm.config.agent_plan import plan_agents
 from swarm.config.load import parse_scenario
 from swarm.grid import GridSpec
-from swarm.right_of_way.holdings import Holdings
 from swarm.right_of_way.shards import Shards
 from swarm.wire.messages.traffic import Granted
 from swarm.wire.messages.vehicles import Obstacle
@@ -38,11 +37,6 @@ EAST_M, SOUTH_M = GRID.cols * GRID.resolution_m, GRID.rows * GRID.resolution_m
 def obstacle(**said: object) -> Obstacle:
     fields = {"id": "r1", "incarnation": 1, "seq": 1, "x_m": 130.0, "y_m": 880.0, "radius_m": 1.0, "lease_s": 1.0}
     return Obstacle(**(fields | said))  # type: ignore[arg-type]
-
-
-def centre(row: int, col: int) -> dict[str, float]:
-    x_m, y_m = GRID.centre_m(GRID.cell(row, col))
-    return {"x_m": x_m, "y_m": y_m}
 
 
 # --- the slow twin: a point walks along the way, and each square is asked how far it is ---------------------------
@@ -197,9 +191,7 @@ SHARDS = Shards(GRID, ["a0"])
 
 def agent_at(cells: list[int]) -> Agent:
     plan = plan_agents(SCENARIO)[0]
-    holdings = Holdings(SHARDS, plan.id, plan.vehicle_ids)
-    holdings.begin_as(1, [])
-    holdings.watch([0])
+    holdings = holdings_of(plan.id, plan.vehicle_ids, SHARDS)
     local = LocalMap(GRID, LEVEL, LEVEL, LEVEL, LEVEL)
     agent = Agent(plan, SCENARIO, local, TruthSensor(GRID, LEVEL, 20.0), holdings, Obstacles(GRID, MARGIN_M))
     grant(agent, 1, dict(zip(plan.vehicle_ids, ([cell] for cell in cells), strict=True)))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -15,7 +16,8 @@ from planner_service.growth_times import MODEL_EXACT_NS_PER_CELL
 from planner_service.planning_process import Planning
 from planner_service.service import PlannerService
 from shared_map.terrain.terrain import terrain_of_pace
-from swarm.bus.bus import AskEnded, Event, Heard, Replied
+from swarm.bus.bus import AskEnded, Event, Heard, Post, Replied
+from swarm.bus.memory_bus import MemoryBus
 from swarm.bus.scheduler import InlineWorker
 from swarm.clock import NS_PER_S
 from swarm.config.scenario import PlannerConfig, Scenario, TargetConfig
@@ -100,6 +102,12 @@ class Ear:
         return [stats for stats in self.of(Stats) if stats.role == role][-1]  # type: ignore[no-any-return]
 
 
+def planning(world: SwarmModel, role: str, id: str, incarnation: int = 1) -> Callable[[MemoryBus, Post], Planning]:
+    """What makes the common part of a process that plans; its worker runs on the world's scheduler."""
+    setup, worker = world.setup(role, id, incarnation), InlineWorker(world.scheduler)
+    return lambda bus, post: Planning(setup, world.terrain, bus, post, worker)
+
+
 class Swarm(SwarmModel):
     """A terrain, planners, a tracker of targets, and an agent that marks."""
 
@@ -124,13 +132,9 @@ class Swarm(SwarmModel):
         self.author = self.writer("a0.1")
 
     def planner(self, target: str, incarnation: int = 1) -> PlannerService:
-        setup = self.setup("planner", target, incarnation)
-        worker = InlineWorker(self.scheduler)
-        return self.start(
-            f"planner-{target}-{incarnation}",
-            lambda bus, post: PlannerService(Planning(setup, self.terrain, bus, post, worker)),
-            phase_ns=0,
-        )
+        plans = planning(self, "planner", target, incarnation)
+        name = f"planner-{target}-{incarnation}"
+        return self.start(name, lambda bus, post: PlannerService(plans(bus, post)), phase_ns=0)
 
     def _track(self) -> None:
         """Ten poses a second of every target that has been put somewhere."""

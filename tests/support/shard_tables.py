@@ -51,8 +51,9 @@ def standing(
     return HostState(shard=0, agent=host, seq=seq, knows=knows, **fields)  # type: ignore[arg-type]
 
 
-def holdings_of() -> Holdings:
-    holdings = Holdings(SHARDS, "a0", ["a0-00"])
+def holdings_of(host: str = "a0", vehicles: Sequence[str] = ("a0-00",), shards: Shards = SHARDS) -> Holdings:
+    """Holdings of a host's first generation, which has heard no grant yet."""
+    holdings = Holdings(shards, host, list(vehicles))
     holdings.begin_as(1, [])
     holdings.watch([0])
     return holdings

@@ -10,11 +10,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.effort import few
 from support.map_strategies import set_of
-from support.planner_swarm import TICK, Ear
+from support.planner_swarm import TICK, Ear, planning
 from support.swarm_model import SwarmModel
 
 from planner_service import service as planner_service
-from planner_service.planning_process import Planning
 from planner_service.service import PlannerService
 from shared_map.cost_map import CostMap
 from shared_map.keeper.zone_orders import rows_of
@@ -23,7 +22,6 @@ from shared_map.replication.replica import MapReplica
 from shared_map.terrain.terrain import Terrain, build_terrain
 from shared_map.vehicle_class_grounds import ClassMaps, class_terrains, read_by
 from swarm.bus.bus import AskEnded, Event
-from swarm.bus.scheduler import InlineWorker
 from swarm.clock import NS_PER_S
 from swarm.config.load import parse_scenario
 from swarm.config.scenario import Scenario
@@ -144,16 +142,14 @@ class _World(SwarmModel):
         scenario, terrain, _ = _made(_DRONE)
         super().__init__(terrain=terrain, scenario=scenario)
         self.ear = Ear(self)
-        setup = self.setup("planner", "t", 1)
-        worker = InlineWorker(self.scheduler)
+        plans = planning(self, "planner", "t")
         self.service = self.start(
-            "planner-t",
-            lambda bus, post: PlannerService(Planning(setup, terrain, bus, post, worker), all_kernels),
-            phase_ns=0,
+            "planner-t", lambda bus, post: PlannerService(plans(bus, post), all_kernels), phase_ns=0
         )
         self.target = _open_cell()
         self._seq = 0
         self._track()
+        self.run(2.0)
 
     def _track(self) -> None:
         self._seq += 1
@@ -183,9 +179,7 @@ def _open_cell() -> int:
 
 @pytest.fixture(scope="module")
 def world() -> _World:
-    made = _World()
-    made.run(2.0)
-    return made
+    return _World()
 
 
 def test_a_tree_is_made_when_first_asked_for_and_dropped_when_unused(world, monkeypatch):
@@ -213,7 +207,6 @@ def test_what_was_grown_for_a_dropped_planner_is_not_taken_for_its_successors(wo
 
 def test_a_zone_for_one_class_is_obeyed_once_the_tree_of_that_class_knows_of_it() -> None:
     world = _World()
-    world.run(2.0)
     world.ask(CostRequest(cells=[world.target], vehicle_class="low"))
     world.run(1.0)
     grid, replica = world.terrain.grid, world.service._replica
@@ -256,7 +249,6 @@ def test_no_route_of_a_class_enters_what_is_lethal_to_it(world: _World, name: st
 def test_while_its_kernels_are_compiled_a_class_is_refused_at_once_and_those_that_need_none_are_served() -> None:
     compiled = False
     world = _World(lambda: compiled)
-    world.run(2.0)
     cells = np.array([world.target], "<u4").tobytes()
     told = Chasers(target="t", author="a0", stamp_ns=0, ids=["a0.v0"], cells=cells, vehicle_class="drone")
     world.ear.bus.publish(CHASERS, told, target="t", author="a0")
@@ -274,7 +266,6 @@ def test_while_its_kernels_are_compiled_a_class_is_refused_at_once_and_those_tha
 
 def test_nobody_waits_for_the_tree_of_another_class() -> None:
     world = _World()
-    world.run(2.0)
     ended: list[str] = []
 
     def ask(name: str) -> None:

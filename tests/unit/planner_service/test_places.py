@@ -7,17 +7,15 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.planner_swarm import COLS, GRID, RES, driven_s, flat, optimum_s, rough
+from support.planner_swarm import COLS, GRID, RES, driven_s, flat, optimum_s, planning, rough
 from support.swarm_model import SwarmModel
 
 import planner_service.places_service as places
 from planner_service.places_service import PlacesService, _ClassTrees
-from planner_service.planning_process import Planning
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.partial_growth import PartialGrowth
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.bus.bus import AskEnded, Event, Replied
-from swarm.bus.scheduler import InlineWorker
 from swarm.config import agent_plan
 from swarm.config.agent_plan import place_job, places_of
 from swarm.config.load import parse_scenario
@@ -37,12 +35,8 @@ class PlacesWorld(SwarmModel):
 
     def __init__(self, pace: Pace, groups: str = "[[groups]]", job: str = "all") -> None:
         super().__init__(terrain=terrain_of_pace(pace, RES), scenario=parse_scenario(f"[[targets]]\n{groups}"))
-        setup, self._job = self.setup("places", job), job
-        worker = InlineWorker(self.scheduler)
-        self.service = self.start(
-            "places",
-            lambda bus, post: PlacesService(Planning(setup, self.terrain, bus, post, worker)),
-        )
+        plans, self._job = planning(self, "places", job), job
+        self.service = self.start("places", lambda bus, post: PlacesService(plans(bus, post)))
         self.client = self.bus("client")
         self.pushed: list[PushedRoute] = []
         self.client.subscribe(PUSHED_ROUTE, lambda event: self.pushed.append(event.message))

@@ -5,13 +5,11 @@ from typing import Any
 
 import numpy as np
 import pytest
-from support.planner_swarm import Ear
+from support.planner_swarm import Ear, planning
 from support.swarm_model import SwarmModel
 
-from planner_service.planning_process import Planning
 from planner_service.service import PlannerService
 from shared_map.terrain.terrain import Terrain, build_terrain
-from swarm.bus.scheduler import InlineWorker
 from swarm.clock import NS_PER_S
 from swarm.config.load import parse_scenario
 from swarm.grid import walk
@@ -44,13 +42,18 @@ class World(SwarmModel):
     def restart(self) -> PlannerService:
         """A planner that knows nothing of the one before."""
         self.generation += 1
-        setup = self.setup("planner", "h", self.generation)
-        worker = InlineWorker(self.scheduler)
-        return self.start(
-            f"planner-h{self.generation}",
-            lambda bus, post: PlannerService(Planning(setup, self.ground, bus, post, worker)),
-            phase_ns=0,
-        )
+        plans = planning(self, "planner", "h", self.generation)
+        name = f"planner-h{self.generation}"
+        return self.start(name, lambda bus, post: PlannerService(plans(bus, post)), phase_ns=0)
+
+    def sight(self, author: str, age_s: int, cell: int) -> None:
+        """Somebody publishes that it has seen the target."""
+        stamp_ns = self.now_ns - age_s * NS_PER_S
+        sighted = Sighted(
+            author=author, group="all", target="h", seq=1, stamp_ns=stamp_ns, until_ns=stamp_ns + 30 * NS_PER_S,
+            cell=cell, x_m=0.0, y_m=0.0, uncertainty_m=1.0,
+        )  # fmt: skip
+        self.ear.bus.publish(SIGHTED, sighted, target="h", author=author)
 
     def route(self, vehicle: str, cell: int, vehicle_class: str = "ground") -> Route:
         """The answer for a vehicle."""
@@ -100,12 +103,7 @@ def test_a_planner_that_begins_anew_searches_from_an_earlier_sighting_that_it_is
         ("all.a0.1", 40, cell),
         ("all.a2.1", 40, 48 * 48),
     ):
-        stamp_ns = world.scheduler.clock.now_ns() - age_s * NS_PER_S
-        sighted = Sighted(
-            author=author, group="all", target="h", seq=1, stamp_ns=stamp_ns, until_ns=stamp_ns + 30 * NS_PER_S,
-            cell=where, x_m=0.0, y_m=0.0, uncertainty_m=1.0,
-        )  # fmt: skip
-        world.ear.bus.publish(SIGHTED, sighted, target="h", author=author)
+        world.sight(author, age_s, where)
     world.run(1)
     belief = search.searcher.belief
     assert search.active
@@ -129,12 +127,7 @@ def test_a_planner_tells_what_it_believes_while_it_searches_and_once_that_it_doe
     assert shares.sum() == pytest.approx(1, abs=1e-3)
     assert len(set(heard[-1].cells)) == len(shares)
     assert max(heard[-1].cells) < world.ground.grid.cells
-    now_ns = world.scheduler.clock.now_ns()
-    sighted = Sighted(
-        author="all.a0.1", group="all", target="h", seq=1, stamp_ns=now_ns, until_ns=now_ns + 30 * NS_PER_S,
-        cell=heard[-1].cells[0], x_m=0.0, y_m=0.0, uncertainty_m=1.0,
-    )  # fmt: skip
-    world.ear.bus.publish(SIGHTED, sighted, target="h", author="all.a0.1")
+    world.sight("all.a0.1", 0, heard[-1].cells[0])
     world.run(2)
     assert heard[-1].cells == []
     many = len(heard)

@@ -49,8 +49,12 @@ class Watch:
 LEADS = "routes lead to where it was, and after 30 s it is searched for"
 
 
-def test_a_pose_outside_is_counted_said_once_and_not_used() -> None:
-    here = Watch()
+@pytest.fixture
+def here() -> Watch:
+    return Watch()
+
+
+def test_a_pose_outside_is_counted_said_once_and_not_used(here: Watch) -> None:
     here.hear()
     for _ in range(5):
         here.hear(cell=GRID.cells)
@@ -62,8 +66,7 @@ def test_a_pose_outside_is_counted_said_once_and_not_used() -> None:
     assert here.watch.pose.cell == GRID.cell(10, 20)
 
 
-def test_a_place_outside_without_a_cell_is_named_by_its_metres() -> None:
-    here = Watch()
+def test_a_place_outside_without_a_cell_is_named_by_its_metres(here: Watch) -> None:
     here.hear(cell=CELL_OF_PLACE, x_m=1234.5, y_m=0.0)
     here.tick()
     assert here.sentences() == [
@@ -72,8 +75,7 @@ def test_a_place_outside_without_a_cell_is_named_by_its_metres() -> None:
 
 
 @pytest.mark.parametrize("off_s", [3600, -3600])
-def test_a_clock_that_is_an_hour_off_changes_nothing(off_s: int) -> None:
-    here = Watch()
+def test_a_clock_that_is_an_hour_off_changes_nothing(off_s: int, here: Watch) -> None:
     for _ in range(5):
         here.hear(stamp_ns=here.now_ns + off_s * NS_PER_S, incarnation=START_NS + off_s * NS_PER_S)
         here.tick()
@@ -82,8 +84,7 @@ def test_a_clock_that_is_an_hour_off_changes_nothing(off_s: int) -> None:
     assert not here.watch.lost(here.now_ns)
 
 
-def test_two_trackers_with_one_name_are_said_once_and_the_later_counts() -> None:
-    here = Watch()
+def test_two_trackers_with_one_name_are_said_once_and_the_later_counts(here: Watch) -> None:
     for _ in range(10):
         here.hear(incarnation=START_NS + NS_PER_S, row=5)
         here.hear(row=12)
@@ -95,9 +96,8 @@ def test_two_trackers_with_one_name_are_said_once_and_the_later_counts() -> None
     assert here.watch.pose.cell // GRID.cols == 5
 
 
-def test_a_second_tracker_is_said_once_and_one_without_a_name_too() -> None:
+def test_a_second_tracker_is_said_once_and_one_without_a_name_too(here: Watch) -> None:
     nameless = f"a tracker without a name, of incarnation {START_NS + 2 * NS_PER_S},"
-    here = Watch()
     here.tick(30)
     for _ in range(5):
         here.hear()
@@ -111,8 +111,7 @@ def test_a_second_tracker_is_said_once_and_one_without_a_name_too() -> None:
     assert here.counted() == {"poses_refused": 10}
 
 
-def test_losing_and_regaining_are_said_each_time_with_the_reason() -> None:
-    here = Watch()
+def test_losing_and_regaining_are_said_each_time_with_the_reason(here: Watch) -> None:
     here.hear()
     here.tick(25)
     here.hear()
@@ -134,8 +133,7 @@ def test_losing_and_regaining_are_said_each_time_with_the_reason() -> None:
     assert here.counted() == {"trackers_lost": 2}
 
 
-def test_a_target_that_only_vehicles_see_is_lost_when_the_sighting_expires() -> None:
-    here = Watch()
+def test_a_target_that_only_vehicles_see_is_lost_when_the_sighting_expires(here: Watch) -> None:
     seen = TargetPose(target="t0", incarnation=0, seq=1, stamp_ns=START_NS, lease_s=30.0, cell=5, x_m=0.0, y_m=0.0)
     here.watch.on_sighting(seen, here.now_ns)
     here.tick(299)
@@ -148,16 +146,14 @@ def test_a_target_that_only_vehicles_see_is_lost_when_the_sighting_expires() -> 
     assert here.told[-1].kind == "tracker-back"
 
 
-def test_a_standby_counts_and_reports_nothing() -> None:
-    here = Watch()
+def test_a_standby_counts_and_reports_nothing(here: Watch) -> None:
     here.watch.leads = False
     here.hear(cell=GRID.cells)
     here.tick()
     assert (here.counted(), here.told) == ({}, [])
 
 
-def test_however_many_trackers_a_liar_makes_up_few_are_named() -> None:
-    here = Watch()
+def test_however_many_trackers_a_liar_makes_up_few_are_named(here: Watch) -> None:
     here.tick(30)
     here.hear()
     for n in range(3000):

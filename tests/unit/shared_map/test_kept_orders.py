@@ -42,8 +42,12 @@ class BookWorld(SwarmModel):
         return answer.orders if isinstance(answer, Orders) else answer
 
 
-def test_an_acknowledged_order_is_on_the_disk(tmp_path: Path) -> None:
-    world = BookWorld()
+@pytest.fixture
+def world() -> BookWorld:
+    return BookWorld()
+
+
+def test_an_acknowledged_order_is_on_the_disk(tmp_path: Path, world: BookWorld) -> None:
     with KeeperStore(tmp_path / "map.sqlite") as store:
         world.keeper("k", store)
         assert isinstance(world.give(subject="pause"), list)
@@ -54,8 +58,7 @@ def test_an_acknowledged_order_is_on_the_disk(tmp_path: Path) -> None:
         assert (order.subject, order.off) == ("pause", False)
 
 
-def test_a_keeper_with_a_new_store_learns_what_is_ordered_and_keepers_agree() -> None:
-    world = BookWorld()
+def test_a_keeper_with_a_new_store_learns_what_is_ordered_and_keepers_agree(world: BookWorld) -> None:
     stores = [KeeperStore(":memory:"), KeeperStore(":memory:")]
     world.keeper("k", stores[0])
     world.give(subject="vehicle", name="a0-01")
@@ -69,8 +72,7 @@ def test_a_keeper_with_a_new_store_learns_what_is_ordered_and_keepers_agree() ->
     assert world.give("k") == world.give("l") == stores[1].orders()
 
 
-def test_a_store_that_cannot_be_written_acknowledges_nothing() -> None:
-    world = BookWorld()
+def test_a_store_that_cannot_be_written_acknowledges_nothing(world: BookWorld) -> None:
     store = KeeperStore(":memory:")
     world.keeper("k", store)
     store._db.execute("PRAGMA query_only = 1")
@@ -81,8 +83,7 @@ def test_a_store_that_cannot_be_written_acknowledges_nothing() -> None:
     assert isinstance(world.give(subject="pause"), list)
 
 
-def test_a_target_is_put_on_passable_ground_of_the_terrain_only() -> None:
-    world = BookWorld()
+def test_a_target_is_put_on_passable_ground_of_the_terrain_only(world: BookWorld) -> None:
     world.keeper("k", KeeperStore(":memory:"))
     assert world.give(subject="target", name="x", row=3, col=4, new=True) == "target x: [3, 4] is lethal"
     outside = world.give(subject="target", name="x", row=-1, col=4, new=True)
@@ -90,8 +91,7 @@ def test_a_target_is_put_on_passable_ground_of_the_terrain_only() -> None:
     assert isinstance(world.give(subject="target", name="x", row=3, col=5, new=True), list)
 
 
-def test_vehicles_of_agents_that_joined_later_are_stopped_too() -> None:
-    world = BookWorld()
+def test_vehicles_of_agents_that_joined_later_are_stopped_too(world: BookWorld) -> None:
     world.keeper("k", KeeperStore(":memory:"))
     assert isinstance(world.give(subject="vehicle", name="guest-03"), str)
     world.bus("guest").declare_alive(Peer("agent", "guest", 7))
@@ -181,8 +181,7 @@ def test_an_agent_hears_its_own_goals_alone_and_keepers_share_all() -> None:
         ({"vehicle": "a0-00", "places": ["cell:5,6", "cell:5,6"], "then": "repeat"}, "two different places"),
     ],
 )
-def test_an_impossible_goal_is_refused_in_a_sentence(order: dict[str, Any], words: str) -> None:
-    world = BookWorld()
+def test_an_impossible_goal_is_refused_in_a_sentence(order: dict[str, Any], words: str, world: BookWorld) -> None:
     store = KeeperStore(":memory:")
     world.keeper("k", store)
     refused = send(world, **order)

@@ -30,6 +30,11 @@ def all_equal(services: Sequence[SyncService | KeeperService]) -> bool:
     return len({service.replica.held.fingerprint() for service in services}) == 1
 
 
+@pytest.fixture
+def swarm() -> SwarmModel:
+    return SwarmModel()
+
+
 def test_a_reader_that_uses_the_map_at_its_ticks_merges_then_or_when_it_is_asked_what_it_holds() -> None:
     swarm = SwarmModel()
     author = swarm.writer("a1.1")
@@ -55,8 +60,7 @@ def test_a_reader_that_uses_the_map_at_its_ticks_merges_then_or_when_it_is_asked
     assert all_equal([author, reader])
 
 
-def test_who_joins_late_asks_once_and_knows_what_authors_alive_and_dead_said() -> None:
-    swarm = SwarmModel()
+def test_who_joins_late_asks_once_and_knows_what_authors_alive_and_dead_said(swarm: SwarmModel) -> None:
     swarm.keeper("keeper", KeeperStore(":memory:"))
     dead, alive = swarm.writer("a1.1"), swarm.writer("a2.1")
     write(dead, swarm, [5, 900])
@@ -70,8 +74,7 @@ def test_who_joins_late_asks_once_and_knows_what_authors_alive_and_dead_said() -
     assert late.replica.take_newest_stamp_ns() is None  # old news say nothing about latency
 
 
-def test_a_keeper_answers_for_all_authors_and_an_agent_for_itself() -> None:
-    swarm = SwarmModel()
+def test_a_keeper_answers_for_all_authors_and_an_agent_for_itself(swarm: SwarmModel) -> None:
     swarm.keeper("keeper", KeeperStore(":memory:"))
     for name in ("a1.1", "a2.1"):
         write(swarm.writer(name), swarm, [5])
@@ -156,9 +159,8 @@ def test_a_role_in_a_digest_counts_for_nothing_and_sets_of_others_only_in_that_o
     assert listener.replica.held.tiles == [0]
 
 
-def test_keepers_without_end_have_few_sets_put_again() -> None:
+def test_keepers_without_end_have_few_sets_put_again(swarm: SwarmModel) -> None:
     """Each digest of a keeper that holds nothing would have every replica put all that it holds of the dead."""
-    swarm = SwarmModel()
     listener, liar = swarm.listener("p"), swarm.network.bus("liar")
     for n in range(360):
         said = set_of(f"x{n // 6}.1", n % 6, 1, {5: (LETHAL, 0, 1)})
@@ -173,8 +175,7 @@ def test_keepers_without_end_have_few_sets_put_again() -> None:
     assert 0 < len(put) <= 4 * replica_sync._OFFERS_AT_ONCE
 
 
-def test_nobody_speaks_under_anothers_key() -> None:
-    swarm = SwarmModel()
+def test_nobody_speaks_under_anothers_key(swarm: SwarmModel) -> None:
     listener = swarm.listener("p")
     liar = swarm.network.bus("liar")
     liar.publish(MARKS, set_of("a1.1", 0, 1, {5: (LETHAL, 0, 1)}), region=0, tile=0, author="liar")
@@ -184,8 +185,7 @@ def test_nobody_speaks_under_anothers_key() -> None:
     assert listener.replica.counts["sets_refused"] == 2
 
 
-def test_nobody_speaks_for_another_in_an_answer_of_many_sets_either() -> None:
-    swarm = SwarmModel()
+def test_nobody_speaks_for_another_in_an_answer_of_many_sets_either(swarm: SwarmModel) -> None:
     liar = swarm.network.bus("liar")
     [lies] = packed([set_of("a1.1", tile, 9, {5: (LETHAL, 0, 1)}) for tile in range(3)])
     [truth] = packed([set_of("liar", 1, 1, {6: (LETHAL, 0, 1)})])
@@ -203,8 +203,7 @@ def test_nobody_speaks_for_another_in_an_answer_of_many_sets_either() -> None:
     assert late.replica.counts["sets_refused"] == 1
 
 
-def test_a_digest_that_was_overtaken_replaces_no_newer_one() -> None:
-    swarm = SwarmModel()
+def test_a_digest_that_was_overtaken_replaces_no_newer_one(swarm: SwarmModel) -> None:
     keeper_says = swarm.network.bus("k")
     listener = swarm.listener("p")
     kept = {seq: np.array([(3, 1, seq)], DIGEST_ROW).tobytes() for seq in (1, 2, 3)}
@@ -225,8 +224,7 @@ def test_a_digest_that_was_overtaken_replaces_no_newer_one() -> None:
     assert pending.digest.held == {"a1.1": kept[3]}
 
 
-def test_a_question_for_everything_is_answered_over_ticks_and_delays_no_other() -> None:
-    swarm = SwarmModel()
+def test_a_question_for_everything_is_answered_over_ticks_and_delays_no_other(swarm: SwarmModel) -> None:
     keeper = swarm.keeper("keeper", KeeperStore(":memory:"))
     keeper.replica.merge(
         [set_of(f"x{n // 6}.1", n % 6, 1, {5: (LETHAL, 0, 1)}) for n in range(1200)], measured=False

@@ -70,8 +70,12 @@ class ZoneWorld(SwarmModel):
         self.run(0.3)
 
 
-def test_a_zone_is_in_every_map_and_gone_once_it_is_removed() -> None:
-    world = ZoneWorld()
+@pytest.fixture
+def world() -> ZoneWorld:
+    return ZoneWorld()
+
+
+def test_a_zone_is_in_every_map_and_gone_once_it_is_removed(world: ZoneWorld) -> None:
     zones = world.add("bridge")
     assert zones.zones == [
         Zone(name="bridge", kind="lethal", pace_s_per_m=None, cells=20, window=[2, 3, 6, 8], until_ns=None)
@@ -84,8 +88,7 @@ def test_a_zone_is_in_every_map_and_gone_once_it_is_removed() -> None:
     assert listed.zones == []
 
 
-def test_what_a_vehicle_finds_in_a_zone_does_not_open_it_and_counts_once_it_is_removed() -> None:
-    world = ZoneWorld()
+def test_what_a_vehicle_finds_in_a_zone_does_not_open_it_and_counts_once_it_is_removed(world: ZoneWorld) -> None:
     world.add()
     inside = min(SQUARE_CELLS)
     world.find(inside, kind=MarkKind.PACE, pace=3.0)
@@ -95,8 +98,7 @@ def test_what_a_vehicle_finds_in_a_zone_does_not_open_it_and_counts_once_it_is_r
     assert (composite.kinds[inside], composite.paces[inside]) == (MarkKind.PACE, 3.0)
 
 
-def test_a_zone_of_a_pace_wins_too_and_the_newer_of_two_zones_counts() -> None:
-    world = ZoneWorld()
+def test_a_zone_of_a_pace_wins_too_and_the_newer_of_two_zones_counts(world: ZoneWorld) -> None:
     world.add("one")
     zones = world.add("two", kind="pace", pace_s_per_m=0.5)
     assert [(zone.name, zone.kind, zone.pace_s_per_m) for zone in zones.zones] == [
@@ -131,8 +133,7 @@ def test_a_removal_counts_as_obeyed_when_its_tombstone_has_come() -> None:
     assert world.planner.replica.lacking("operator.z", removed.sets) == []
 
 
-def test_a_hole_of_a_zone_stays_open() -> None:
-    world = ZoneWorld()
+def test_a_hole_of_a_zone_stays_open(world: ZoneWorld) -> None:
     world.add(holes=[[(3.0, 4.0), (3.0, 6.0), (5.0, 6.0), (5.0, 4.0)]])
     assert world.lethal() == SQUARE_CELLS - {row * COLS + col for row in (3, 4) for col in (4, 5)}
     kept = all_but([(2.0, 3.0), (2.0, 8.0), (6.0, 8.0), (6.0, 3.0)], GridSpec(ROWS, COLS, 1.0), 256)
@@ -143,13 +144,11 @@ def test_a_hole_of_a_zone_stays_open() -> None:
     assert "its edges cross or touch each other" in str(outside)
 
 
-def test_a_zone_without_a_name_gets_one_that_was_never_used() -> None:
-    world = ZoneWorld()
+def test_a_zone_without_a_name_gets_one_that_was_never_used(world: ZoneWorld) -> None:
     assert [world.add("").changed, world.add("", polygon=[(10, 0), (10, 5), (15, 5)]).changed] == ["z1", "z2"]
 
 
-def test_metres_are_those_of_poses() -> None:
-    world = ZoneWorld()
+def test_metres_are_those_of_poses(world: ZoneWorld) -> None:
     grid = world.terrain.grid
     corners = [
         (grid.west_m + col * grid.resolution_m, grid.north_m - row * grid.resolution_m) for row, col in SQUARE
@@ -262,8 +261,7 @@ def test_the_map_has_exactly_the_zones_that_were_ordered_and_not_taken_back(scri
     assert set(np.flatnonzero(composite.kinds == MarkKind.LETHAL).tolist()) == set().union(*stands.values())
 
 
-def test_who_hears_other_groups_forgets_those_it_does_not_hear_any_more_and_keeps_zones() -> None:
-    world = ZoneWorld()
+def test_who_hears_other_groups_forgets_those_it_does_not_hear_any_more_and_keeps_zones(world: ZoneWorld) -> None:
     replica = world.planner.replica
     world.add()
     for group in ("red", "blue"):

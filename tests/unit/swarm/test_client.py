@@ -25,7 +25,7 @@ from swarm.bus.bus import LinkChanged
 from swarm.client import BusError, ConfigError, Frame, Route, RunMismatchError, Stream
 from swarm.client.connected_swarm import agreed
 from swarm.client.observer import marked
-from swarm.client.vehicle import OwnMarks
+from swarm.client.vehicle import OwnMarks, Vehicle
 from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec
 from swarm.wire.messages import WIRE_VERSION
@@ -55,11 +55,25 @@ def world() -> Swarm:
     return swarm
 
 
+@pytest.fixture
+def obstacles(world: Swarm) -> Obstacles:
+    return Obstacles(world)
+
+
+@pytest.fixture
+def program(world: Swarm) -> Program:
+    return Program(world)
+
+
+@pytest.fixture
+def rover(program: Program) -> Vehicle:
+    return program.swarm.vehicle("rover")
+
+
 # --- where a vehicle is -------------------------------------------------------------------------------------------
 
 
-def test_a_vehicle_is_heard_at_once_repeated_while_it_stands_and_gone_when_it_leaves(world: Swarm) -> None:
-    obstacles, program = Obstacles(world), Program(world)
+def test_a_vehicle_is_heard_at_once_repeated_while_it_stands_and_gone_when_it_leaves(world, obstacles, program):
     with program.swarm.vehicle("rover", radius_m=2.0, lease_s=1.0) as rover:
         rover.at(105.0, -55.0, heading_rad=1.0, speed_m_per_s=3.0)
         world.run(0.01)
@@ -80,8 +94,7 @@ def test_a_vehicle_is_heard_at_once_repeated_while_it_stands_and_gone_when_it_le
 
 
 @pytest.mark.parametrize(("x_m", "y_m"), NOWHERE)
-def test_a_place_outside_or_no_number_is_refused_counted_and_loses_nothing(world, x_m, y_m):
-    obstacles, program = Obstacles(world), Program(world)
+def test_a_place_outside_or_no_number_is_refused_counted_and_loses_nothing(world, x_m, y_m, obstacles, program):
     with program.swarm as swarm:
         rover, target = swarm.vehicle("rover"), swarm.target("t9")
         rover.at(5.0, -5.0)
@@ -102,8 +115,7 @@ def test_a_place_outside_or_no_number_is_refused_counted_and_loses_nothing(world
     [{"id": "a b"}, {"id": "a0-01"}, {"group": "x/y"}, {"radius_m": -1.0}, {"radius_m": math.nan}, {"lease_s": 0.0},
      {"lease_s": 1e9}, {"id": 5}, {"id": []}, {"radius_m": "5"}, {"radius_m": 100.1}, {"lease_s": None}],
 )  # fmt: skip
-def test_a_vehicle_that_cannot_be_is_refused_in_a_sentence(world: Swarm, wrong: dict[str, Any]) -> None:
-    program = Program(world)
+def test_a_vehicle_that_cannot_be_is_refused_in_a_sentence(wrong: dict[str, Any], program: Program) -> None:
     (name,) = wrong
     with pytest.raises(ConfigError, match=name):
         program.swarm.vehicle(**({"id": "rover"} | wrong))
@@ -173,8 +185,7 @@ def test_one_text_is_no_list_of_texts(world: Swarm) -> None:
             call()
 
 
-def test_one_program_has_each_vehicle_and_target_once_at_a_time(world: Swarm) -> None:
-    program = Program(world)
+def test_one_program_has_each_vehicle_and_target_once_at_a_time(program: Program) -> None:
     for make in (program.swarm.vehicle, program.swarm.target):
         first: Any = make("one")
         with pytest.raises(ConfigError, match="one is in use in this program already"):
@@ -183,8 +194,7 @@ def test_one_program_has_each_vehicle_and_target_once_at_a_time(world: Swarm) ->
         make("one")
 
 
-def test_what_is_made_takes_part_once_it_is_whole_as_ticks_come_on_another_thread(world, monkeypatch):
-    program = Program(world)
+def test_what_is_made_takes_part_once_it_is_whole_as_ticks_come_on_another_thread(world, monkeypatch, program):
     add = program.session.add
 
     def add_and_tick(part: Any) -> None:
@@ -197,8 +207,7 @@ def test_what_is_made_takes_part_once_it_is_whole_as_ticks_come_on_another_threa
         thing.leave()
 
 
-def test_wrong_headings_and_speeds_are_refused_by_the_rules_of_the_wire(world: Swarm) -> None:
-    rover = Program(world).swarm.vehicle("rover")
+def test_wrong_headings_and_speeds_are_refused_by_the_rules_of_the_wire(rover: Vehicle) -> None:
     for wrong in (
         {"heading_rad": 99.0}, {"heading_rad": "N"}, {"speed_m_per_s": -1.0}, {"speed_m_per_s": math.nan},
         {"speed_m_per_s": 341.0}, {"x_m": "5"}, {"x_m": None}, {"y_m": 10**400},
@@ -224,8 +233,7 @@ def test_two_programs_with_one_id_are_both_told_whose_word_counts(world: Swarm) 
 # --- routes -------------------------------------------------------------------------------------------------------
 
 
-def test_a_route_is_the_planners_and_costs_what_it_says(world: Swarm, caplog: pytest.LogCaptureFixture) -> None:
-    rover = Program(world).swarm.vehicle("rover")
+def test_a_route_is_the_planners_and_costs_what_it_says(world, caplog, rover):
     rover.at(*GRID.centre_m(GRID.cell(30, 3)))
     asked, given_up = rover.route_soon("t"), rover.route_soon("t")
     assert given_up.cancel()
@@ -251,8 +259,7 @@ def test_a_route_from_anywhere_needs_no_vehicle(world: Swarm) -> None:
         swarm.route_soon("t", -1e6, 0.0)
 
 
-def test_no_planner_is_a_bus_error_and_a_place_comes_first(world: Swarm) -> None:
-    rover = Program(world).swarm.vehicle("rover")
+def test_no_planner_is_a_bus_error_and_a_place_comes_first(world: Swarm, rover: Vehicle) -> None:
     with pytest.raises(ConfigError, match="call at\\(\\) first"):
         rover.route("t")
     rover.at(5.0, -5.0)
@@ -264,8 +271,7 @@ def test_no_planner_is_a_bus_error_and_a_place_comes_first(world: Swarm) -> None
         rover.route("a/b")
 
 
-def test_who_follows_a_target_gets_a_new_route_when_it_moves_and_none_while_nothing_changes(world: Swarm) -> None:
-    rover = Program(world).swarm.vehicle("rover")
+def test_who_follows_a_target_gets_a_new_route_when_it_moves_and_none_while_nothing_changes(world, rover):
     rover.at(*GRID.centre_m(GRID.cell(30, 3)))
     told: list[Route] = []
     rover.on_route(told.append)
@@ -280,9 +286,7 @@ def test_who_follows_a_target_gets_a_new_route_when_it_moves_and_none_while_noth
     assert routes.closed
 
 
-def test_a_follower_on_lethal_ground_is_told_where_it_is(world: Swarm) -> None:
-    program = Program(world)
-    rover = program.swarm.vehicle("rover")
+def test_a_follower_on_lethal_ground_is_told_where_it_is(world: Swarm, program: Program, rover: Vehicle) -> None:
     cell = GRID.cell(30, 3)
     rover.at(*GRID.centre_m(cell))
     rover.mark([cell], lethal=True)
@@ -292,9 +296,7 @@ def test_a_follower_on_lethal_ground_is_told_where_it_is(world: Swarm) -> None:
     assert program.problems == ["vehicle rover is on lethal ground, row 30, col 3: no route leads from there"]
 
 
-def test_a_planner_that_goes_is_told_once_and_its_successor_followed_without_a_word(world: Swarm) -> None:
-    program = Program(world)
-    rover = program.swarm.vehicle("rover")
+def test_a_planner_that_goes_is_told_once_and_its_successor_followed_without_a_word(world, program, rover):
     rover.at(*GRID.centre_m(GRID.cell(30, 3)))
     routes = rover.follow("t")
     world.run(1.0)
@@ -307,8 +309,7 @@ def test_a_planner_that_goes_is_told_once_and_its_successor_followed_without_a_w
     assert routes.newest.cells[-1] == GRID.cell(33, 33)
 
 
-def test_a_vehicle_asks_by_its_class_and_is_told_once_if_there_is_none(world: Swarm) -> None:
-    program = Program(world)
+def test_a_vehicle_asks_by_its_class_and_is_told_once_if_there_is_none(world: Swarm, program: Program) -> None:
     rover = program.swarm.vehicle("walker", vehicle_class="boat")
     rover.at(*GRID.centre_m(GRID.cell(30, 3)))
     rover.follow("t")
@@ -410,9 +411,7 @@ def test_most_processes_say_which_run_it_is_and_what_time() -> None:
         ({"pace_s_per_m": "quick"}, "pace_s_per_m is 'quick', expected a number"),
     ],
 )
-def test_a_wrong_mark_is_refused_whole(world: Swarm, wrong: dict[str, Any], complaint: str) -> None:
-    program = Program(world)
-    rover = program.swarm.vehicle("rover")
+def test_a_wrong_mark_is_refused_whole(world, wrong, complaint, program, rover):
     with pytest.raises(ConfigError, match=complaint):
         rover.mark(**({"cells": [3]} | wrong))
     world.run(0.5)
@@ -563,8 +562,7 @@ def test_a_group_chases_what_it_is_told_or_again_what_the_scenario_says(world, m
     assert told == [given]
 
 
-def test_a_link_that_comes_back_says_everything_again_at_once(world: Swarm) -> None:
-    obstacles, program = Obstacles(world), Program(world)
+def test_a_link_that_comes_back_says_everything_again_at_once(world, obstacles, program):
     rover = program.swarm.vehicle("rover", lease_s=10.0)
     rover.at(5.0, -5.0)
     world.run(0.1)
@@ -581,9 +579,7 @@ def test_a_link_that_comes_back_says_everything_again_at_once(world: Swarm) -> N
 
 
 @pytest.mark.parametrize("late", [False, True])
-def test_another_run_behind_the_link_ends_the_connection_in_a_sentence(world: Swarm, late: bool) -> None:
-    program = Program(world)
-    rover = program.swarm.vehicle("rover")
+def test_another_run_behind_the_link_ends_the_connection_in_a_sentence(world, late, program, rover):
     world.kill("planner-t-1")
     world.kill("a0.1")
     world.cut(program.bus)
@@ -599,8 +595,7 @@ def test_another_run_behind_the_link_ends_the_connection_in_a_sentence(world: Sw
         rover.at(5.0, -5.0)
 
 
-def test_a_closed_connection_takes_everything_away_and_says_so(world: Swarm) -> None:
-    obstacles, program = Obstacles(world), Program(world)
+def test_a_closed_connection_takes_everything_away_and_says_so(world, obstacles, program):
     with program.swarm as swarm:
         rover = swarm.vehicle("rover")
         rover.at(5.0, -5.0)
@@ -614,9 +609,7 @@ def test_a_closed_connection_takes_everything_away_and_says_so(world: Swarm) -> 
     swarm.close()
 
 
-def test_a_callback_that_fails_ends_nothing_and_one_that_would_wait_for_ever_is_told(world: Swarm) -> None:
-    program = Program(world)
-    rover = program.swarm.vehicle("rover")
+def test_a_callback_that_fails_ends_nothing_and_one_that_would_wait_for_ever_is_told(world, program, rover):
     rover.at(*GRID.centre_m(GRID.cell(30, 3)))
     errors: list[BaseException] = []
 

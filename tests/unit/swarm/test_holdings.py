@@ -5,9 +5,14 @@ import pytest
 from support.shard_tables import GRID, MEMBERS, SHARDS, S, entries, granted_of, hear, holdings_of, table_of
 
 from swarm.right_of_way.generations import HEARTBEAT_NS
-from swarm.right_of_way.holdings import Wish
+from swarm.right_of_way.holdings import Holdings, Wish
 from swarm.wire.messages.traffic import Entry, Left
 from swarm.wire.topics import HOST_STATE
+
+
+@pytest.fixture
+def holdings() -> Holdings:
+    return holdings_of()
 
 
 def test_no_word_of_one_generation_hides_that_of_another() -> None:
@@ -15,8 +20,7 @@ def test_no_word_of_one_generation_hides_that_of_another() -> None:
     assert not HOST_STATE.newest
 
 
-def test_a_grant_that_is_implausibly_far_ahead_is_refused_and_named() -> None:
-    holdings = holdings_of()
+def test_a_grant_that_is_implausibly_far_ahead_is_refused_and_named(holdings: Holdings) -> None:
     far = 3 * ((1 << 40) + 1)
     for lie in (table_of(far, 1, a0=[9]), table_of(1, 1 << 40, a0=[9])):
         hear(holdings, lie, S)
@@ -26,8 +30,7 @@ def test_a_grant_that_is_implausibly_far_ahead_is_refused_and_named() -> None:
     assert (list(holdings.path("a0-00")), holdings._views[0].heard_ns) == ([9], 2 * S)
 
 
-def test_a_generation_that_is_replaced_places_no_vehicle_by_a_grant_that_comes_late() -> None:
-    holdings = holdings_of()
+def test_a_generation_that_is_replaced_places_no_vehicle_by_a_grant_that_comes_late(holdings: Holdings) -> None:
     younger = msgspec.structs.replace(granted_of(table_of(1, 1, a0=[9])), generation=2)
     holdings.hear_granted(younger, S)
     assert holdings.replaced
@@ -35,16 +38,14 @@ def test_a_generation_that_is_replaced_places_no_vehicle_by_a_grant_that_comes_l
     assert list(holdings.path("a0-00")) == []
 
 
-def test_a_host_takes_what_follows_its_path() -> None:
-    holdings = holdings_of()
+def test_a_host_takes_what_follows_its_path(holdings: Holdings) -> None:
     hear(holdings, table_of(1, 1, a0=[9]))
     assert list(holdings.path("a0-00")) == [9]
     hear(holdings, table_of(1, 2, a0=[9, *entries(1, 2, 10, 20)]))
     assert list(holdings.path("a0-00")) == [9, 10]  # 20 does not follow
 
 
-def test_an_entry_given_back_is_not_taken_again_and_another_of_the_same_cell_is() -> None:
-    holdings = holdings_of()
+def test_an_entry_given_back_is_not_taken_again_and_another_of_the_same_cell_is(holdings: Holdings) -> None:
     hear(holdings, table_of(1, 1, a0=[9]))
     hear(holdings, table_of(1, 2, a0=[9, *entries(1, 2, 10, 11)]))
     holdings.give_back("a0-00")
@@ -60,8 +61,7 @@ def test_an_entry_given_back_is_not_taken_again_and_another_of_the_same_cell_is(
     assert list(holdings.path("a0-00")) == [9, 10]
 
 
-def test_a_host_gives_back_what_another_waits_for_far_ahead_and_says_so_at_once() -> None:
-    holdings = holdings_of()
+def test_a_host_gives_back_what_another_waits_for_far_ahead_and_says_so_at_once(holdings: Holdings) -> None:
     holdings.keeps = 2
     cells = [8, 9, 10, 11, 12, 13, 14]
     hear(holdings, table_of(1, 1, a0=cells))
@@ -76,8 +76,7 @@ def test_a_host_gives_back_what_another_waits_for_far_ahead_and_says_so_at_once(
     assert [*told.standing.vehicles[0].holds] == [(cell, 1, 1) for cell in cells[:5]]
 
 
-def test_to_have_driven_on_is_no_news_until_another_waits_or_little_is_left() -> None:
-    holdings = holdings_of()
+def test_to_have_driven_on_is_no_news_until_another_waits_or_little_is_left(holdings: Holdings) -> None:
     holdings.keeps = 2
     cells, wish = [8, 9, 10, 11, 12, 13, 14], {"a0-00": Wish()}
     hear(holdings, table_of(1, 1, a0=cells))
@@ -97,8 +96,7 @@ def test_to_have_driven_on_is_no_news_until_another_waits_or_little_is_left() ->
     assert held_by_word() == cells[5:]
 
 
-def test_a_vehicle_follows_on_the_word_of_the_host_that_was_before_it_and_of_no_other() -> None:
-    holdings = holdings_of()
+def test_a_vehicle_follows_on_the_word_of_the_host_that_was_before_it_and_of_no_other(holdings: Holdings) -> None:
     hear(holdings, table_of(1, 1, a0=[9]))
     waits = Entry((10, 1, 2), [(1, 1, "a1-00")])
     table = table_of(1, 2, a0=[9, waits.number])
@@ -129,8 +127,7 @@ def test_a_host_says_what_it_has_left_to_those_who_follow_until_a_table_lists_it
     assert holdings.lefts(9 * S) == []
 
 
-def test_the_older_of_two_generations_learns_that_it_is_replaced() -> None:
-    holdings = holdings_of()
+def test_the_older_of_two_generations_learns_that_it_is_replaced(holdings: Holdings) -> None:
     table = table_of(1, 1, a0=[9])
     table.hosts["a0"] = (2, 1)
     hear(holdings, table)
@@ -139,8 +136,7 @@ def test_the_older_of_two_generations_learns_that_it_is_replaced() -> None:
     assert all(told.standing.ended for told in holdings.standings({}, S))
 
 
-def test_a_host_speaks_to_the_leader_that_it_hears_and_else_to_all_members() -> None:
-    holdings = holdings_of()
+def test_a_host_speaks_to_the_leader_that_it_hears_and_else_to_all_members(holdings: Holdings) -> None:
     assert [told.members for told in holdings.standings({}, S)] == [MEMBERS]
     hear(holdings, table_of(1, 1, a0=[9]), 2 * S)
     assert [told.members for told in holdings.standings({}, 2 * S)] == [(SHARDS.leader(0, 1),)]
@@ -152,15 +148,13 @@ def test_a_host_speaks_to_the_leader_that_it_hears_and_else_to_all_members() -> 
 
 
 @pytest.mark.parametrize("lie", [[0, -8], [-8], [56, 64], [1 << 31]])
-def test_cells_from_nowhere_are_not_driven_to(lie: list[int]) -> None:
-    holdings = holdings_of()
+def test_cells_from_nowhere_are_not_driven_to(lie: list[int], holdings: Holdings) -> None:
     hear(holdings, table_of(1, 1, a0=lie))
     hear(holdings, table_of(1, 2, a0=[*lie, -16]))
     assert all(0 <= cell < GRID.cells for cell in holdings.path("a0-00"))
 
 
-def test_a_host_is_gone_once_it_holds_and_requests_nothing_and_every_leader_knows_it() -> None:
-    holdings = holdings_of()
+def test_a_host_is_gone_once_it_holds_and_requests_nothing_and_every_leader_knows_it(holdings: Holdings) -> None:
     hear(holdings, table_of(1, 1, a0=[9]))
     assert not holdings.gone
     holdings.watched.clear()

@@ -3,6 +3,7 @@
 import threading
 import time
 from collections import Counter
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 
 import pytest
@@ -85,6 +86,21 @@ def pose(target: str, seq: int) -> Heard:
     return Heard(TRUE_POSE, {"target": target}, message)
 
 
+@pytest.fixture
+def inbox() -> Inbox:
+    return Inbox()
+
+
+@pytest.fixture
+def clock() -> Time:
+    return Time()
+
+
+def post_all(inbox: Inbox, events: Iterable[Event]) -> None:
+    for event in events:
+        inbox.post(event)
+
+
 def drain(inbox: Inbox) -> list[Event]:
     taken = []
     while (event := inbox.take(0)) is not None:
@@ -92,10 +108,8 @@ def drain(inbox: Inbox) -> list[Event]:
     return taken
 
 
-def test_of_samples_that_say_everything_only_the_newest_per_key_is_kept_in_the_oldest_place():
-    inbox = Inbox()
-    for event in (pose("t0", 1), note("x"), pose("t1", 1), pose("t0", 2), note("y"), pose("t0", 3)):
-        inbox.post(event)
+def test_of_samples_that_say_everything_only_the_newest_per_key_is_kept_in_the_oldest_place(inbox):
+    post_all(inbox, (pose("t0", 1), note("x"), pose("t1", 1), pose("t0", 2), note("y"), pose("t0", 3)))
     assert len(inbox) == 4
     assert inbox.superseded == 2
     assert drain(inbox) == [pose("t0", 3), note("x"), pose("t1", 1), note("y")]
@@ -103,8 +117,7 @@ def test_of_samples_that_say_everything_only_the_newest_per_key_is_kept_in_the_o
     assert drain(inbox) == [pose("t0", 4)]
 
 
-def test_many_threads_may_post():
-    inbox = Inbox()
+def test_many_threads_may_post(inbox):
 
     def post(name: str) -> None:
         for n in range(500):
@@ -127,8 +140,7 @@ def batch(n: int) -> HeardMany:
     return HeardMany(NOTE, [(f"note/agent/a{n}", note(n).message)])
 
 
-def test_who_brings_batches_waits_until_the_owner_has_kept_up():
-    inbox = Inbox()
+def test_who_brings_batches_waits_until_the_owner_has_kept_up(inbox):
     brought: list[int] = []
 
     def bring() -> None:
@@ -147,8 +159,7 @@ def test_who_brings_batches_waits_until_the_owner_has_kept_up():
     assert taken == [batch(n) for n in range(10)]
 
 
-def test_nobody_waits_for_an_owner_that_has_ended():
-    inbox = Inbox()
+def test_nobody_waits_for_an_owner_that_has_ended(inbox):
     bringer = threading.Thread(target=lambda: [inbox.post(batch(n)) for n in range(5)])
     bringer.start()
     bringer.join(0.1)
@@ -158,16 +169,14 @@ def test_nobody_waits_for_an_owner_that_has_ended():
     assert not bringer.is_alive()
 
 
-def test_a_take_waits_for_a_post_and_no_longer():
-    inbox = Inbox()
+def test_a_take_waits_for_a_post_and_no_longer(inbox):
     threading.Timer(0.05, inbox.post, [note("x")]).start()
     began_s = time.monotonic()
     assert inbox.take(5.0) == note("x")
     assert time.monotonic() - began_s < 2.0
 
 
-def test_what_a_worker_fails_with_is_raised_where_the_state_is_owned():
-    inbox = Inbox()
+def test_what_a_worker_fails_with_is_raised_where_the_state_is_owned(inbox):
     inbox.post(note("x"))
     inbox.fail(RuntimeError("boom"))
     assert inbox.take(0) == note("x")
@@ -175,60 +184,49 @@ def test_what_a_worker_fails_with_is_raised_where_the_state_is_owned():
         inbox.take(0)
 
 
-def test_of_a_topics_samples_the_oldest_go_beyond_the_capacity_and_no_other_topics():
-    inbox = Inbox()
+def test_of_a_topics_samples_the_oldest_go_beyond_the_capacity_and_no_other_topics(inbox):
     inbox.post(pose("t0", 1))
-    for n in range(CAPACITY + 100):
-        inbox.post(note(n))
+    post_all(inbox, (note(n) for n in range(CAPACITY + 100)))
     assert len(inbox) == CAPACITY + 1
     assert inbox.counts["events_dropped"] == 100
     assert drain(inbox) == [pose("t0", 1), *(note(n) for n in range(100, CAPACITY + 100))]
 
 
-def test_the_keys_of_which_the_newest_is_kept_are_bounded_too():
-    inbox = Inbox()
+def test_the_keys_of_which_the_newest_is_kept_are_bounded_too(inbox):
     for seq in range(2):
         for n in range(CAPACITY):
             inbox.post(pose(f"t{n}", seq))
     assert inbox.counts["events_dropped"] == 0
-    for n in range(5):
-        inbox.post(pose(f"more{n}", 1))
+    post_all(inbox, (pose(f"more{n}", 1) for n in range(5)))
     assert len(inbox) == CAPACITY
     assert inbox.counts["events_dropped"] == 5
     assert {event.message.seq for event in drain(inbox)} == {1}
 
 
-def test_replies_tokens_links_and_results_are_never_dropped():
+def test_replies_tokens_links_and_results_are_never_dropped(inbox):
     peer = Peer("agent", "a0", 7)
     kept: list[Event] = [
         *(Replied("q", RUN, {}, Nothing()) for _ in range(CAPACITY)), AskEnded("q", RUN, CAPACITY, None),
         *(Appeared(peer), Disappeared(peer), LinkChanged(up=True), WorkDone("grow", 1, 1)),
     ]  # fmt: skip
-    inbox = Inbox()
-    for event in kept:
-        inbox.post(event)
-    for n in range(2 * CAPACITY):
-        inbox.post(note(n))
+    post_all(inbox, kept)
+    post_all(inbox, (note(n) for n in range(2 * CAPACITY)))
     assert drain(inbox)[: len(kept)] == kept
 
 
-def test_a_question_too_many_refuses_the_oldest_in_words():
-    inbox, clock = Inbox(), Time()
+def test_a_question_too_many_refuses_the_oldest_in_words(inbox, clock):
     askers = [Asker(clock) for _ in range(PER_ASKER + 1)]
-    for asker in askers:
-        inbox.post(asker.question)
+    post_all(inbox, (asker.question for asker in askers))
     assert askers[0].refusals == ["cost: too many questions wait"]
     assert askers[0].ended_s is not None
     assert inbox.counts == {"events_dropped": 1, "asks_expired": 0}
     assert drain(inbox) == [asker.question for asker in askers[1:]]
 
 
-def test_a_question_whose_asker_has_left_is_refused_and_never_taken():
-    inbox, clock = Inbox(), Time()
+def test_a_question_whose_asker_has_left_is_refused_and_never_taken(inbox, clock):
     short, long = Asker(clock, timeout_s=1.0), Asker(clock, timeout_s=5.0)
     newest_but_short = Asker(clock, timeout_s=1.5)
-    for asker in (short, long, newest_but_short):
-        inbox.post(asker.question)
+    post_all(inbox, (asker.question for asker in (short, long, newest_but_short)))
     clock.now_s = 3.0
     assert drain(inbox) == [long.question]
     assert [asker.ended_s for asker in (short, long, newest_but_short)] == [3.0, None, 3.0]
@@ -237,11 +235,9 @@ def test_a_question_whose_asker_has_left_is_refused_and_never_taken():
     assert len(inbox) == 0
 
 
-def test_an_undecoded_question_is_decoded_once_when_its_turn_comes():
-    inbox, clock = Inbox(), Time()
+def test_an_undecoded_question_is_decoded_once_when_its_turn_comes(inbox, clock):
     asker = Asker(clock)
-    for event in (note(1), asker.undecoded, note(2)):
-        inbox.post(event)
+    post_all(inbox, (note(1), asker.undecoded, note(2)))
     assert inbox.take(0) == note(1)
     assert asker.decoded == 0
     assert inbox.take(0) is asker.question
@@ -249,26 +245,22 @@ def test_an_undecoded_question_is_decoded_once_when_its_turn_comes():
     assert drain(inbox) == [note(2)]
 
 
-def test_a_question_that_is_rejected_when_its_turn_comes_is_no_event():
-    inbox, clock = Inbox(), Time()
+def test_a_question_that_is_rejected_when_its_turn_comes_is_no_event(inbox, clock):
     inbox.post(Asker(clock, rejected=True).undecoded)
     inbox.post(note(1))
     assert [inbox.take(0), inbox.take(0)] == [None, note(1)]
 
 
-def test_an_undecoded_question_that_nobody_answers_is_refused_and_never_decoded():
-    inbox, clock = Inbox(), Time()
+def test_an_undecoded_question_that_nobody_answers_is_refused_and_never_decoded(inbox, clock):
     askers = [Asker(clock, timeout_s=1.0) for _ in range(PER_ASKER + 1)]
-    for asker in askers:
-        inbox.post(asker.undecoded)
+    post_all(inbox, (asker.undecoded for asker in askers))
     clock.now_s = 3.0
     assert drain(inbox) == []
     assert inbox.counts == {"events_dropped": 1, "asks_expired": PER_ASKER}
     assert all(len(asker.refusals) == 1 and asker.decoded == 0 for asker in askers)
 
 
-def test_without_overload_questions_and_samples_come_in_the_order_of_their_arrival():
-    inbox, clock = Inbox(), Time()
+def test_without_overload_questions_and_samples_come_in_the_order_of_their_arrival(inbox, clock):
     events = [
         Asker(clock).question,
         note(1),
@@ -277,16 +269,14 @@ def test_without_overload_questions_and_samples_come_in_the_order_of_their_arriv
         Asker(clock).question,
         LinkChanged(up=False),
     ]
-    for event in events:
-        inbox.post(event)
+    post_all(inbox, events)
     clock.now_s = 0.4
     assert drain(inbox) == events
 
 
 @pytest.mark.parametrize("load", [2.0, 2.5, 10.0])
-def test_under_overload_what_is_answered_goes_to_those_who_still_wait(load):
+def test_under_overload_what_is_answered_goes_to_those_who_still_wait(load, inbox, clock):
     """Ten seconds, 5 ms for each answer: 200 a second are answered, all but the first few at once."""
-    inbox, clock = Inbox(), Time()
     askers: list[Asker] = []
     waits: list[float] = []
     while clock.now_s < 10.0:
@@ -305,15 +295,12 @@ def test_under_overload_what_is_answered_goes_to_those_who_still_wait(load):
     assert len(inbox) <= 2.1 * 200 * load  # no question stays longer than its asker
 
 
-def test_while_questions_come_late_samples_and_other_questions_take_turns_with_them():
-    inbox, clock = Inbox(), Time()
-    for _ in range(100):
-        inbox.post(Asker(clock).question)
+def test_while_questions_come_late_samples_and_other_questions_take_turns_with_them(inbox, clock):
+    post_all(inbox, (Asker(clock).question for _ in range(100)))
     clock.now_s = 1.0
     route = Asker(clock, topic=ROUTE)
     inbox.post(route.question)
-    for n in range(3):
-        inbox.post(note(n))
+    post_all(inbox, (note(n) for n in range(3)))
     taken = [inbox.take(0) for _ in range(10)]
     assert route.question in taken[:3]
     assert [event for event in taken if isinstance(event, Heard)] == [note(n) for n in range(3)]
@@ -323,11 +310,11 @@ def test_while_questions_come_late_samples_and_other_questions_take_turns_with_t
     ("timeout_s", "waited_s", "late"),
     [(0.6, 0.29, False), (0.6, 0.31, True), (5.0, 0.49, False), (5.0, 0.51, True)],
 )
-def test_a_question_is_late_after_half_a_second_or_half_of_its_askers_timeout(timeout_s, waited_s, late):
-    inbox, clock = Inbox(), Time()
+def test_a_question_is_late_after_half_a_second_or_half_of_its_askers_timeout(
+    timeout_s, waited_s, late, inbox, clock
+):
     askers = [Asker(clock, timeout_s=timeout_s) for _ in range(2)]
-    for asker in askers:
-        inbox.post(asker.question)
+    post_all(inbox, (asker.question for asker in askers))
     clock.now_s = waited_s
     assert inbox.take(0) is askers[late].question  # of late ones the newest is taken
 
@@ -374,8 +361,7 @@ def test_askers_without_a_name_share_one_turn_on_all_costly_topics() -> None:
     assert served_before(inbox, Asker(clock, name="rover.r1")) <= 1
 
 
-def test_an_asker_pays_by_the_bytes_of_its_questions() -> None:
-    inbox, clock = Inbox(), Time()
+def test_an_asker_pays_by_the_bytes_of_its_questions(inbox: Inbox, clock: Time) -> None:
     for _ in range(20):
         inbox.post(Asker(clock, name="rover.dear", size=10_000).undecoded)
         inbox.post(Asker(clock, name="rover.cheap", size=1_000).undecoded)
@@ -389,24 +375,22 @@ def test_agents_that_flood_each_other_take_turns_too() -> None:
     assert served_before(inbox, Asker(clock, name="agent.a0", size=200)) <= 1
 
 
-def test_a_full_queue_refuses_the_askers_own_question_and_then_the_oldest_stranger() -> None:
-    inbox, clock = Inbox(), Time()
+def test_a_full_queue_refuses_the_askers_own_question_and_then_the_oldest_stranger(
+    inbox: Inbox, clock: Time
+) -> None:
     first = Asker(clock, name="rover.q")
     vehicle = Asker(clock, name="agent.a0")
     inbox.post(vehicle.undecoded)
     inbox.post(first.undecoded)
-    for _ in range(PER_ASKER):
-        inbox.post(Asker(clock, name="rover.q").undecoded)
+    post_all(inbox, (Asker(clock, name="rover.q").undecoded for _ in range(PER_ASKER)))
     assert first.refusals == ["cost: too many questions wait of rover.q"]
-    for n in range(2 * MOST):
-        inbox.post(Asker(clock, name=f"rover.x{n}").undecoded)
+    post_all(inbox, (Asker(clock, name=f"rover.x{n}").undecoded for n in range(2 * MOST)))
     assert len(inbox) == MOST
     assert vehicle.refusals == []
     assert inbox.take(0) is vehicle.question
 
 
-def test_names_without_end_are_forgotten() -> None:
-    inbox, clock = Inbox(), Time()
+def test_names_without_end_are_forgotten(inbox: Inbox, clock: Time) -> None:
     inbox.post(Asker(clock, name="agent.a0").undecoded)
     for n in range(3 * MOST):
         inbox.post(Asker(clock, name=f"agent.x{n}").undecoded)

@@ -38,6 +38,11 @@ class Node:
 ROUTER = {"role": "router", "id": "0", "run_id": NO_RUN, "terrain": "", "rows": 0}
 
 
+@pytest.fixture
+def world() -> SwarmModel:
+    return SwarmModel()
+
+
 @pytest.mark.parametrize(
     "members",
     [
@@ -46,8 +51,7 @@ ROUTER = {"role": "router", "id": "0", "run_id": NO_RUN, "terrain": "", "rows": 
         [ROUTER, {"id": "t0"}, {"id": "t1"}],  # a router belongs to no run
     ],
 )
-def test_members_of_one_run_get_along(members):
-    world = SwarmModel()
+def test_members_of_one_run_get_along(members, world):
     nodes = [Node(world, **each) for each in members]
     for node in nodes:
         node.member.join()
@@ -81,8 +85,7 @@ def test_members_of_one_run_get_along(members):
         ),
     ],
 )
-def test_one_that_does_not_belong_ends_with_a_sentence_and_the_others_go_on(changes, words):
-    world = SwarmModel()
+def test_one_that_does_not_belong_ends_with_a_sentence_and_the_others_go_on(changes, words, world):
     first, stranger = Node(world), Node(world, id="t1", **changes)
     first.member.join()
     world.settle()
@@ -104,8 +107,7 @@ def test_a_router_that_answers_first_hides_no_other_run():
     check_belongs(INFO, [foreign, router, INFO])
 
 
-def test_of_two_that_start_at_once_at_least_one_notices():
-    world = SwarmModel()
+def test_of_two_that_start_at_once_at_least_one_notices(world):
     one, other = Node(world), Node(world, id="t1", run_id="r2")
     one.member.join()
     other.member.join()
@@ -113,8 +115,7 @@ def test_of_two_that_start_at_once_at_least_one_notices():
     assert one.failure or other.failure
 
 
-def test_who_meets_only_after_a_cut_heals_is_checked_then():
-    world = SwarmModel()
+def test_who_meets_only_after_a_cut_heals_is_checked_then(world):
     one, other = Node(world), Node(world, id="t1", run_id="r2")
     world.cut(other.bus)
     one.member.join()
@@ -128,8 +129,7 @@ def test_who_meets_only_after_a_cut_heals_is_checked_then():
     assert LinkChanged(True) in other.rest
 
 
-def test_who_sees_a_router_appear_compares_anew_but_does_not_take_its_own_link_to_be_up():
-    world = SwarmModel()
+def test_who_sees_a_router_appear_compares_anew_but_does_not_take_its_own_link_to_be_up(world):
     node = Node(world)
     node.member.join()
     world.settle()
@@ -188,8 +188,7 @@ def test_once_somebody_has_confirmed_a_process_no_false_answer_ends_it_and_the_s
     assert "belongs to run r1, but agent zz" in notes[0].message.text
 
 
-def test_a_process_that_starts_beside_a_stranger_joins_those_who_agree():
-    world = SwarmModel()
+def test_a_process_that_starts_beside_a_stranger_joins_those_who_agree(world):
     first, liar = Node(world), Node(world, role="agent", id="zz", run_id="another")
     first.member.join()
     world.settle()

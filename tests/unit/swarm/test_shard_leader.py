@@ -1,11 +1,10 @@
 """The grants, releases and messages of a shard's leader."""
 
 from msgspec.structs import replace
-from support.shard_tables import SHARDS, S, cells_of, entries, standing, table_of
+from support.shard_tables import SHARDS, S, cells_of, entries, holdings_of, standing, table_of
 
 from swarm.right_of_way.cell_orders import Orders
 from swarm.right_of_way.generations import HEARTBEAT_NS, first_generation, is_far_ahead
-from swarm.right_of_way.holdings import Holdings
 from swarm.right_of_way.shard_leader import Leader
 from swarm.wire.messages.traffic import Held, Stand
 
@@ -72,9 +71,7 @@ def test_an_older_generation_is_told_that_it_is_replaced_by_a_leader_that_never_
         (granted,) = leader.granted(table if told is None else told, S)
         assert (granted.host, granted.generation) == ("a1", 2 << 32)
         leader = Leader(SHARDS, "a0", 3, table, {"a1": ["a1-00"]})
-    older = Holdings(SHARDS, "a1", ["a1-00"])
-    older.begin_as(1, [])
-    older.watch([0])
+    older = holdings_of("a1", ["a1-00"])
     older.hear_granted(granted, S)
     assert older.replaced
 

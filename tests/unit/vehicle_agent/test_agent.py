@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from support.makers import route_reply
-from support.shard_tables import grants_of
+from support.shard_tables import grants_of, holdings_of
 
 from shared_map.terrain.terrain import terrain_of_pace
 from shared_map.vehicle_class_grounds import class_grounds
@@ -18,7 +18,6 @@ from swarm.config.agent_plan import plan_agents
 from swarm.config.load import parse_scenario
 from swarm.config.scenario import Scenario
 from swarm.grid import GridSpec
-from swarm.right_of_way.holdings import Holdings
 from swarm.right_of_way.shards import Shards
 from swarm.wire.fields import column
 from swarm.wire.messages.traffic import Granted
@@ -45,9 +44,7 @@ S = 1_000_000_000
 def agent_of(scenario: Scenario, index: int = 0) -> Agent:
     ground = LocalMap(GRID, LEVEL, LEVEL, LEVEL, LEVEL)
     plan = plan_agents(scenario)[index]
-    holdings = Holdings(Shards(GRID, ["a0", "a1"]), plan.id, plan.vehicle_ids)
-    holdings.begin_as(1, [])
-    holdings.watch([0])
+    holdings = holdings_of(plan.id, plan.vehicle_ids, Shards(GRID, ["a0", "a1"]))
     return Agent(plan, scenario, ground, TruthSensor(GRID, LEVEL, 20.0), holdings)
 
 

@@ -7,12 +7,11 @@ import pytest
 from msgspec.structs import replace
 from support.agent_world import OPEN, AgentWorld, pace_of, scenario
 from support.bus_world import answer_of
+from support.planner_swarm import planning
 
 from planner_service.places_service import PlacesService
-from planner_service.planning_process import Planning
 from shared_map.keeper.mark_store import KeeperStore
 from swarm.bus.bus import Event
-from swarm.bus.scheduler import InlineWorker
 from swarm.wire.messages import Message
 from swarm.wire.messages.orders import GiveOrder, GoalState, SendVehicle, ZoneOrder
 from swarm.wire.messages.vehicles import VehicleState
@@ -29,9 +28,8 @@ class SentWorld(AgentWorld):
         super().__init__(text, pace_of(picture))
         self.store = KeeperStore(":memory:")
         self.keeper("k", self.store)
-        setup = self.setup("places", "all")
-        worker = InlineWorker(self.scheduler)
-        self.start("places", lambda bus, post: PlacesService(Planning(setup, self.terrain, bus, post, worker)))
+        plans = planning(self, "places", "all")
+        self.start("places", lambda bus, post: PlacesService(plans(bus, post)))
         self.progress: dict[str, GoalState] = {}
         self.person = self.bus("person")
         self.person.subscribe(GOAL_STATES, self._told)
