@@ -134,6 +134,8 @@ def type_text(hint: Any) -> str:
         return _bounded(*taken_apart(hint))
     if origin in (types.UnionType, typing.Union):
         return "|".join("nil" if arg is type(None) else type_text(arg) for arg in args)
+    if origin is typing.Literal:
+        return "|".join(map(repr, args))
     if origin is list:
         return f"[{type_text(args[0])}]"
     if origin is tuple:
