@@ -37,6 +37,10 @@ def state_of(host: str, stands: list[Stand], seq: int, generation: int = 1 << 32
     return HostState(shard=0, agent=host, generation=generation, seq=seq, knows=(0, 0), vehicles=stands)
 
 
+def known(agent: str, generation: int, shards: list[int], agents: list[str], generations: list[int]) -> Known:
+    return Known(agent=agent, disk=0, generation=generation, shards=shards, agents=agents, generations=generations)
+
+
 def entered(cell: int = 70) -> tuple[ExternalVehicle, Leader]:
     external, leader = ExternalVehicle(SHARDS, "rover"), leader_of()
     external.enter(cell)
@@ -167,15 +171,7 @@ def test_an_operator_frees_what_all_generations_of_an_external_vehicle_hold_and_
     generations = [77, leader._orders.hosts["rover"][0]]
     removal = Removal(SHARDS, "rover")
     for agent in SHARDS.agents:
-        known = Known(
-            agent=agent,
-            disk=0,
-            generation=generations[1],
-            shards=[0],
-            agents=list(SHARDS.agents),
-            generations=generations,
-        )
-        removal.hear_known(known)
+        removal.hear_known(known(agent, generations[1], [0], list(SHARDS.agents), generations))
     assert removal.known
     assert removal.host.informed
     removal.begin(3)
@@ -196,9 +192,7 @@ def test_an_operator_frees_what_all_generations_of_an_external_vehicle_hold_and_
     back = ExternalVehicle(SHARDS, "rover", [generations[1]])
     for agent in SHARDS.agents:
         generation, _ = leader._orders.hosts["rover"]
-        back.host.hear_known(
-            Known(agent=agent, disk=0, generation=generation, shards=[], agents=[], generations=[])
-        )
+        back.host.hear_known(known(agent, generation, [], [], []))
     back.enter(90)
     back.begin(9)
     talk(back, leader, 2_000_000_000)
