@@ -9,7 +9,7 @@ from collections.abc import Sequence
 
 import numpy as np
 import pytest
-from support.swarm_model import LossyLinks, SwarmModel, SyncService
+from support.swarm_model import LossyLinks, SwarmModel, SyncService, hold_the_same
 
 from shared_map.keeper.mark_store import KeeperStore
 from shared_map.keeper.service import KeeperService
@@ -20,13 +20,9 @@ STEP_S = 0.1
 Services = Sequence[SyncService | KeeperService]
 
 
-def equal(services: Services) -> bool:
-    return len({service.replica.held.fingerprint() for service in services}) == 1
-
-
 def until_equal_s(swarm: SwarmModel, services: Services, at_most_s: float = 60.0) -> float:
     waited_s = 0.0
-    while not equal(services):
+    while not hold_the_same(services):
         assert waited_s < at_most_s, "not equal in time"
         swarm.run(STEP_S)
         waited_s += STEP_S

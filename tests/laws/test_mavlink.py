@@ -54,10 +54,6 @@ incoming = st.one_of(
 ways = st.sampled_from([TO_THE_EAST, WITH_A_TURN, NOWHERE])
 
 
-def heard(message: codec.Incoming) -> Callable[[World], object]:
-    return lambda world: world.hear(message)
-
-
 def became(**values: object) -> Callable[[World], object]:
     """The vehicle or the world after a change from outside."""
 
@@ -71,7 +67,7 @@ def became(**values: object) -> Callable[[World], object]:
 steps = st.lists(
     st.tuples(
         st.one_of(
-            incoming.map(heard),
+            incoming.map(lambda message: lambda world: world.hear(message)),
             ways.map(lambda way: lambda world: world.adapter.hear_way(way)),
             st.booleans().map(lambda up: lambda world: world.adapter.hear_swarm(up)),
             st.booleans().map(lambda speaks: became(speaks=speaks)),

@@ -104,11 +104,6 @@ def random_ground(random: np.random.Generator, rows: int, cols: int, lethal: flo
     return pace
 
 
-def found_batch(finder: RouteFinder, pace: NDArray[np.float32], random: np.random.Generator) -> RouteBatch:
-    starts = random.choice(np.flatnonzero(np.isfinite(pace)), 4)
-    return finder._tree.routes([*starts.tolist(), -1])
-
-
 @settings(max_examples=60)
 @given(st.integers(0, 2**32 - 1), st.sampled_from((0.0, 0.2)), st.booleans(), st.sampled_from((4, 8)))
 def test_cells_of_pulled_routes_are_those_that_their_segments_cross(
@@ -118,7 +113,8 @@ def test_cells_of_pulled_routes_are_those_that_their_segments_cross(
     pace = random_ground(random, *random.integers(2, 30, 2).tolist(), lethal)
     config = PlannerConfig(corner_cutting=corner_cutting, neighbours=neighbours)
     finder = RouteFinder(pace, (0, 0), corner_cutting=corner_cutting, neighbours=neighbours)
-    batch = found_batch(finder, pace, random)
+    starts = random.choice(np.flatnonzero(np.isfinite(pace)), 4)
+    batch = finder._tree.routes([*starts.tolist(), -1])
     pulled = Puller(pace, 1.0, config).pull_batch(batch)
     for same in (RouteBatch.of(list(batch)), batch.columns().batch):  # read-only, as those of a search are
         assert list(Puller(pace, 1.0, config).pull_batch(same)) == list(pulled)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -42,6 +43,10 @@ def written(path: Path, bands: Any, dtype: str | None = "float32", **profile: An
         for name, values in later.items():
             setattr(file, name, values)
     return path
+
+
+def said(notes: Sequence[str], words: str) -> bool:
+    return any(words in note for note in notes)
 
 
 def load(source: Path | str, **keys: Any) -> Source:

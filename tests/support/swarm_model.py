@@ -45,6 +45,11 @@ class SyncService:
         pass
 
 
+def hold_the_same(services: Sequence[SyncService | KeeperService]) -> bool:
+    """True if the replicas of these services hold the same sets of marks."""
+    return len({service.replica.held.fingerprint() for service in services}) == 1
+
+
 class LossyLinks:
     """Links that drop, repeat and delay by chance; a cut keeps apart what lies on its two sides. By default every
     message arrives once, after the same short time."""

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import rasterio
 from rasterio.transform import from_origin
-from support.height_models import SIDE, hills, load, written
+from support.height_models import SIDE, hills, load, said, written
 
 from shared_map.importers.cover.land_cover import TABLES, read_cover, read_cover_table
 from shared_map.terrain.pace_layers import TerrainClass
@@ -31,10 +31,6 @@ def expected(codes: Any, key: str) -> tuple[Any, Any]:
     grounds = TABLES[key].grounds
     kinds = np.vectorize(lambda code: int(grounds[code].kind))(codes)
     return kinds, np.vectorize(lambda code: grounds[code].factor)(codes)
-
-
-def said(notes: tuple[str, ...], words: str) -> bool:
-    return any(words in note for note in notes)
 
 
 @pytest.fixture

@@ -32,13 +32,9 @@ WORDS = st.dictionaries(st.integers(0, 255), SAID, max_size=4)
 THRICE = Measurement(400, round(np.log(3) * ONE), ONE // 10)
 
 
-def _terrain() -> Terrain:
-    pace = np.full((40, 50), 0.5, np.float32)
-    pace[5, 5:20] = np.inf
-    return terrain_of_pace(pace)
-
-
-GROUND = _terrain()
+PACE = np.full((40, 50), 0.5, np.float32)
+PACE[5, 5:20] = np.inf
+GROUND = terrain_of_pace(PACE)
 FEW = settings(max_examples=15, deadline=None)
 
 

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 from support.map_strategies import set_of
-from support.swarm_model import SwarmModel
+from support.swarm_model import SwarmModel, hold_the_same
 
 from shared_map.keeper.mark_store import KeeperStore
 from shared_map.keeper.service import _NAME_AT_MOST, THROTTLED
@@ -201,6 +201,4 @@ def test_a_loud_author_is_named_and_late_but_loses_nothing_and_holds_nobody_up()
     assert listener.sync.throttled == []
     assert [each.over_ns is None for each in keeper._member.alarms.current()] == [False]
     assert THROTTLED + "loud" not in keeper.counters.gauges
-    assert (
-        listener.replica.held.fingerprint() == loud.replica.held.fingerprint() == keeper.replica.held.fingerprint()
-    )
+    assert hold_the_same([listener, loud, keeper])

@@ -39,10 +39,6 @@ POINTS = ((-30.0, 3.0), (0.0, 1.0), (20.0, 4.0))
 """Points of the rule `table`."""
 
 
-def ruled(rule: str, **cost: object) -> CostConfig:
-    return CostConfig(slope_rule=rule, slope_table=POINTS if rule == "table" else (), **cost)
-
-
 def whole(heights_m: np.ndarray) -> np.ndarray:
     return padded_rows(heights_m, 0, len(heights_m))
 
@@ -84,7 +80,7 @@ def test_a_void_counts_as_level_with_its_neighbours_and_spoils_none() -> None:
 
 @pytest.mark.parametrize("rule", RULES)
 def test_level_ground_costs_one_and_steeper_never_less(rule: str) -> None:
-    cost = ruled(rule, max_slope_deg=35)
+    cost = CostConfig(slope_rule=rule, slope_table=POINTS if rule == "table" else (), max_slope_deg=35)
     grades = np.tan(np.radians(np.linspace(0, 40, 200))).astype(np.float32)
     factor = slope_factor(grades, cost)
     assert factor[0] == pytest.approx(1.0, abs=1e-6) or rule == "tobler"

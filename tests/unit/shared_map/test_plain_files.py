@@ -25,9 +25,8 @@ def load(path: Path, text: str | bytes | None = None, **settings: object) -> Sou
     return load_source(TerrainConfig(source=str(path), **settings), seed=1)
 
 
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
+BAD: dict[str, list[tuple[str | bytes, str]]] = {
+    "a.asc": [
         (ASC.replace("ncols 3", "ncols 2.5"), "its header says ncols '2.5', expected a whole number"),
         (ASC.replace("ncols 3", "ncols 3x"), "its header says ncols '3x', expected a whole number"),
         (ASC.replace("cellsize 50", "cellsize 5_0"), "its header says cellsize '5_0', expected a number"),
@@ -59,10 +58,21 @@ def load(path: Path, text: str | bytes | None = None, **settings: object) -> Sou
         (b"\xfd\xfe\x00", "is no raster that is read: it begins with .*gdal_translate"),
         ("", "is no raster that is read: it begins with b''"),
     ],
-)
-def test_a_bad_ascii_grid_is_refused_with_a_sentence(tmp_path: Path, text: str | bytes, words: str) -> None:
+    "a.map": [
+        (MAP.replace("GS.W", "GS."), "line 6: 3 cells; expected 3 rows of 4"),
+        (MAP.replace("O...\n", ""), "2 rows; its header says 3"),
+        (MAP.replace("O...", "O.x."), "line 7, column 3: 'x' is no ground"),
+        (MAP.replace("height 3", "height many"), "no MovingAI map"),
+        (MAP.replace("height 3", "height 99999999").replace("width 4", "width 9999"), "has 99999999 x 9999 cells"),
+        ("hello", "no MovingAI map"),
+    ],
+}
+
+
+@pytest.mark.parametrize(("name", "text", "words"), [(name, *each) for name, bad in BAD.items() for each in bad])
+def test_a_bad_file_is_refused_with_a_sentence(tmp_path: Path, name: str, text: str | bytes, words: str) -> None:
     with pytest.raises(TerrainError, match=words):
-        load(tmp_path / "a.asc", text)
+        load(tmp_path / name, text)
 
 
 def test_a_bad_npz_is_refused_with_a_sentence(tmp_path: Path) -> None:
@@ -122,22 +132,6 @@ def test_a_movingai_map_is_open_or_lethal_cell_by_cell(tmp_path: Path) -> None:
     np.testing.assert_array_equal(np.isinf(terrain.pace_s_per_m), lethal)
     assert (terrain.pace_s_per_m[~lethal] == 0.25).all()
     assert terrain.grid.resolution_m == 1
-
-
-@pytest.mark.parametrize(
-    ("text", "words"),
-    [
-        (MAP.replace("GS.W", "GS."), "line 6: 3 cells; expected 3 rows of 4"),
-        (MAP.replace("O...\n", ""), "2 rows; its header says 3"),
-        (MAP.replace("O...", "O.x."), "line 7, column 3: 'x' is no ground"),
-        (MAP.replace("height 3", "height many"), "no MovingAI map"),
-        (MAP.replace("height 3", "height 99999999").replace("width 4", "width 9999"), "has 99999999 x 9999 cells"),
-        ("hello", "no MovingAI map"),
-    ],
-)
-def test_a_bad_map_is_refused_with_a_sentence(tmp_path: Path, text: str, words: str) -> None:
-    with pytest.raises(TerrainError, match=words):
-        load(tmp_path / "a.map", text)
 
 
 def ros(folder, yaml=YAML, image=b"P5\n# made by hand\n3 2\n255\n\xfe\x00\xcd\xfe\xfe\x00"):

@@ -3,6 +3,7 @@
 import msgspec
 from hypothesis import given
 from hypothesis import strategies as st
+from support.makers import target_pose
 
 from launch_scripts.simulation.sample_worlds import SMALL
 from launch_scripts.simulation.simulate import Simulation
@@ -12,7 +13,7 @@ from shared_map.sightings import LONGEST_NS, Sightings, pose_of
 from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec
 from swarm.peers import POSE_SILENCE_NS
-from swarm.wire.messages.planning import Sighted, TargetPose
+from swarm.wire.messages.planning import Sighted
 from swarm.wire.topics import SIGHTED
 from vehicle_agent.driving.driven_vehicle import Places, Vehicle
 from vehicle_agent.sensing.target_detector import SIGHTING_LASTS_NS, TargetDetector
@@ -91,8 +92,7 @@ def test_of_a_group_that_is_not_read_nothing_is_known() -> None:
 
 def test_a_vehicle_tells_of_targets_in_range_and_how_sure_it_is() -> None:
     detector = TargetDetector(GRID, "red.a0.1", "red", 100.0, MarkFilter(GRID), set())
-    x_m, y_m = GRID.centre_m(GRID.cell(10, 10))
-    detector.set_truth(TargetPose(target="t", incarnation=1, seq=1, stamp_ns=0, cell=410, x_m=x_m, y_m=y_m), 0)
+    detector.set_truth(target_pose("t", GRID.cell(10, 10), GRID), 0)
     far, near = Vehicle("u", GRID, GRID.cell(10, 30)), Vehicle("v", GRID, GRID.cell(10, 15))
     assert detector.detect(Places(GRID, [far]), 0) == []
     (told,) = detector.detect(Places(GRID, [far, near]), 0)
@@ -106,9 +106,7 @@ def test_a_planner_that_begins_anew_is_told_the_last_sighting_by_whoever_had_it_
     near = Places(GRID, [Vehicle("v", GRID, GRID.cell(10, 15))])
 
     def stand(cell: int, seq: int, at_s: int, jumps: int = 0) -> None:
-        x_m, y_m = GRID.centre_m(cell)
-        pose = TargetPose(target="t", incarnation=1, seq=seq, stamp_ns=0, cell=cell, x_m=x_m, y_m=y_m, jumps=jumps)
-        detector.set_truth(pose, at_s * NS_PER_S)
+        detector.set_truth(target_pose("t", cell, GRID, seq=seq, jumps=jumps), at_s * NS_PER_S)
 
     def retold(at_s: int) -> list[Sighted]:
         detector.retell("t", at_s * NS_PER_S)

@@ -1,14 +1,12 @@
 """Sync: marks reach every replica once links are back, whatever was lost, and hostile digests cost little."""
 
-from collections.abc import Sequence
 
 import numpy as np
 import pytest
 from support.map_strategies import Composite, set_of, sets_asked
-from support.swarm_model import LossyLinks, SwarmModel, SyncService
+from support.swarm_model import LossyLinks, SwarmModel, SyncService, hold_the_same
 
 from shared_map.keeper.mark_store import KeeperStore
-from shared_map.keeper.service import KeeperService
 from shared_map.replication import replica_sync
 from shared_map.replication.marks import packed
 from shared_map.replication.replica import MapReplica
@@ -24,10 +22,6 @@ LETHAL, CLEAR = MarkKind.LETHAL, MarkKind.CLEAR
 
 def write(service: SyncService, swarm: SwarmModel, cells: list[int], kind: MarkKind = LETHAL) -> None:
     service.sync.publish(service.replica.write(cells, kind, 0.0, swarm.now_ns))
-
-
-def all_equal(services: Sequence[SyncService | KeeperService]) -> bool:
-    return len({service.replica.held.fingerprint() for service in services}) == 1
 
 
 @pytest.fixture
@@ -50,14 +44,14 @@ def test_a_reader_that_uses_the_map_at_its_ticks_merges_then_or_when_it_is_asked
         swarm.run(0.15)
     assert reader.replica.held.fingerprint() != author.replica.held.fingerprint()
     swarm.run(1)
-    assert all_equal([author, reader])
+    assert hold_the_same([author, reader])
     write(author, swarm, [8])
     swarm.run(0.15)
-    assert not all_equal([author, reader])
+    assert not hold_the_same([author, reader])
     (rows,) = author.replica.own_digest().values()
     swarm.buses["p"].gather()
     assert reader.sync.holds("a1.1", rows, swarm.now_ns)  # what an order needs is not fetched: it waits here
-    assert all_equal([author, reader])
+    assert hold_the_same([author, reader])
 
 
 def test_who_joins_late_asks_once_and_knows_what_authors_alive_and_dead_said(swarm: SwarmModel) -> None:
@@ -70,7 +64,7 @@ def test_who_joins_late_asks_once_and_knows_what_authors_alive_and_dead_said(swa
     late = swarm.listener("late")
     swarm.run(0.05)
     assert late.sync.joined
-    assert all_equal([late, dead, alive])
+    assert hold_the_same([late, dead, alive])
     assert late.replica.take_newest_stamp_ns() is None  # old news say nothing about latency
 
 
@@ -97,9 +91,9 @@ def test_a_lost_set_is_fetched_after_the_next_digest_and_nothing_else_is() -> No
     write(author, swarm, [40])  # another tile
     swarm.run(0.2)
     links.dropped = 0.0
-    assert not all_equal([author, listener])
+    assert not hold_the_same([author, listener])
     swarm.run(1.5)
-    assert all_equal([author, listener])
+    assert hold_the_same([author, listener])
     assert listener.replica.counts["sets_repeated"] == known
 
 
@@ -122,11 +116,7 @@ def test_what_the_keeper_missed_of_the_dead_is_given_to_it_by_whoever_heard_it(p
     sent = [decode(each, Digest) for _, node, to, topic, each in swarm.deliveries if (topic, to) == ("digest", "p")
             and node == "keeper.1"]  # fmt: skip
     assert any(digest.after is not None for digest in sent) == (part_bytes == 200)
-    assert (
-        keeper.replica.held.fingerprint()
-        == listener.replica.held.fingerprint()
-        == author.replica.held.fingerprint()
-    )
+    assert hold_the_same([keeper, listener, author])
 
 
 def test_a_role_in_a_digest_counts_for_nothing_and_sets_of_others_only_in_that_of_a_keeper() -> None:
@@ -207,21 +197,15 @@ def test_a_digest_that_was_overtaken_replaces_no_newer_one(swarm: SwarmModel) ->
     keeper_says = swarm.network.bus("k")
     listener = swarm.listener("p")
     kept = {seq: np.array([(3, 1, seq)], DIGEST_ROW).tobytes() for seq in (1, 2, 3)}
-    for seq in (2, 1):
-        digest = Digest(author="keeper.k.1", role="keeper", held={"a1.1": kept[seq]}, seq=seq)
+    uncounted: dict[str, int] = {}
+    for row, numbered, held in ((2, {"seq": 2}, 2), (1, {"seq": 1}, 2), (3, uncounted, 3)):
+        digest = Digest(author="keeper.k.1", role="keeper", held={"a1.1": kept[row]}, **numbered)
         keeper_says.publish(DIGEST, digest, author="keeper.k.1")
         swarm.run(0.01)
         swarm.buses["p"].gather()
         listener.sync.tick(swarm.now_ns)
-    [pending] = listener.sync._digests._pending.values()
-    assert pending.digest.held == {"a1.1": kept[2]}
-    uncounted = Digest(author="keeper.k.1", role="keeper", held={"a1.1": kept[3]})
-    keeper_says.publish(DIGEST, uncounted, author="keeper.k.1")
-    swarm.run(0.01)
-    swarm.buses["p"].gather()
-    listener.sync.tick(swarm.now_ns)
-    [pending] = listener.sync._digests._pending.values()
-    assert pending.digest.held == {"a1.1": kept[3]}
+        [pending] = listener.sync._digests._pending.values()
+        assert pending.digest.held == {"a1.1": kept[held]}
 
 
 def test_a_question_for_everything_is_answered_over_ticks_and_delays_no_other(swarm: SwarmModel) -> None:

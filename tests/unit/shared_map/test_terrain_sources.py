@@ -11,11 +11,10 @@ import pytest
 import rasterio
 from rasterio.transform import Affine, from_origin
 from scipy.io import netcdf_file
-from support.height_models import load, written
+from support.height_models import load, said, written
 
 from shared_map.importers.cover.photos import read_photo
 from shared_map.importers.georeference import check_size, metres_per_degree
-from shared_map.importers.terrain_sources import Source
 from shared_map.terrain.pace_layers import TerrainClass
 from shared_map.terrain.terrain import build_terrain
 from swarm.config.ground import TerrainConfig
@@ -34,10 +33,6 @@ def heights(rows: int = 40, cols: int = 50) -> np.ndarray:
 
 def write(path: Path, bands: np.ndarray, transform: Affine = UTM, crs: Any = "EPSG:32632", **profile: Any) -> Path:
     return written(path, bands, None, transform=transform, crs=crs, **profile)
-
-
-def said(source: Source, words: str) -> bool:
-    return any(words in note for note in source.notes)
 
 
 # --- GeoTIFF ------------------------------------------------------------------------------------------------
@@ -71,8 +66,8 @@ def test_systems_whose_unit_is_no_true_metre_are_reprojected(tmp_path: Path, crs
 def test_a_rotated_file_is_turned_north_up_and_says_so(tmp_path: Path) -> None:
     turned = Affine(20 * np.cos(0.5), 20 * np.sin(0.5), UTM.c, 20 * np.sin(0.5), -20 * np.cos(0.5), UTM.f)
     source = load(write(tmp_path / "a.tif", heights(), turned))
-    assert said(source, "rotated")
-    assert said(source, "voids")
+    assert said(source.notes, "rotated")
+    assert said(source.notes, "voids")
     known = source.elevation_m[~np.isnan(source.elevation_m)]
     assert 0.5 < known.size / source.elevation_m.size < 0.95
     assert heights().min() - 1 <= known.min()
@@ -94,7 +89,7 @@ def test_scale_and_offset_are_applied_and_said(tmp_path: Path) -> None:
     raw = np.round(heights() * 10).astype(np.int16) - 3000
     source = load(write(tmp_path / "a.tif", raw, scales=(0.1,), offsets=(300.0,)))
     np.testing.assert_allclose(source.elevation_m, heights(), atol=0.06)
-    assert said(source, "scale 0.1 and offset 300")
+    assert said(source.notes, "scale 0.1 and offset 300")
 
 
 @pytest.mark.parametrize("dtype", ["float32", "int16"])
@@ -106,7 +101,7 @@ def test_voids_nan_and_infinite_cells_are_voids_counted_and_said(tmp_path: Path,
     source = load(write(tmp_path / "a.tif", values, nodata=-9999))
     count = 253 if dtype == "float32" else 250
     assert np.isnan(source.elevation_m).sum() == count
-    assert said(source, "of the cells) are lethal; crop the file, or set terrain.nodata = 'fill'")
+    assert said(source.notes, "of the cells) are lethal; crop the file, or set terrain.nodata = 'fill'")
     assert not np.isnan(load(tmp_path / "a.tif", nodata="fill").elevation_m).any()
     terrain = build_terrain(Scenario(terrain=TerrainConfig(source=str(tmp_path / "a.tif"))))
     assert (np.isinf(terrain.pace_s_per_m) == np.isnan(source.elevation_m)).all()
@@ -138,7 +133,7 @@ def test_a_photo_of_another_projection_and_depth_with_alpha(tmp_path: Path) -> N
     assert not seen[:, :23].any()
     assert seen[2:-2, 27:-1].all()
     assert (source.classes[~seen] == TerrainClass.UNKNOWN).all()
-    assert said(source, "stretched")
+    assert said(source.notes, "stretched")
 
 
 # --- bad rasters --------------------------------------------------------------------------------------------

@@ -209,20 +209,14 @@ def test_factors_and_paces_come_from_a_column_a_value_or_a_class(tmp_path: Path)
     np.testing.assert_allclose(pace[[3, 20], [3, 3]], [0.7, 0.1])
     pace, _ = painted([ZoneConfig(kind="pace", file=file, pace_s_per_m=0.7)], ground=np.inf)
     assert np.isinf(pace).all()  # a pace opens nothing
-    with pytest.raises(
-        TerrainError,
-        match=r"set pace_s_per_m, or attribute to the column that holds it; it has the",
+    for kind, column, words in (
+        ("pace", None, r"set pace_s_per_m, or attribute to the column that holds it; it has the"),
+        ("pace", "g", r"has no column 'g'; it has the columns f, kind"),
+        ("road", None, r"has no column highway or fclass; set attribute .* or width_m; it has"),
+        ("road", "kind", r"none of its features on the terrain counts \(2 of class mud"),
     ):
-        painted([ZoneConfig(kind="pace", file=file)])
-    with pytest.raises(TerrainError, match=r"has no column 'g'; it has the columns f, kind"):
-        painted([ZoneConfig(kind="pace", file=file, attribute="g")])
-    with pytest.raises(
-        TerrainError,
-        match=r"has no column highway or fclass; set attribute .* or width_m; it has",
-    ):
-        painted([ZoneConfig(kind="road", file=file)])
-    with pytest.raises(TerrainError, match=r"none of its features on the terrain counts \(2 of class mud"):
-        painted([ZoneConfig(kind="road", file=file, attribute="kind")])
+        with pytest.raises(TerrainError, match=words):
+            painted([ZoneConfig(kind=kind, file=file, attribute=column)])
     roads, _ = painted([ZoneConfig(kind="road", file=file, width_m=5.0)])
     assert roads[3, 3] == np.float32(0.05)
 
@@ -281,14 +275,12 @@ def test_long_edges_are_bent_as_the_map_bends_them(tmp_path: Path) -> None:
 def test_a_terrain_across_180_degrees_has_zones_on_both_sides(tmp_path: Path) -> None:
     west_m, north_m = (float(v[0]) for v in to_crs("EPSG:4326", "EPSG:3994", [179.7], [-17.0]))
     grid = GridSpec(40, 60, 1000.0, west_m, north_m, "EPSG:3994")
-    cut = {"type": "MultiPolygon", "coordinates": [
-        [[[179.8, -17.2], [180, -17.2], [180, -17.1], [179.8, -17.1], [179.8, -17.2]]],
-        [[[-180, -17.2], [-179.9, -17.2], [-179.9, -17.1], [-180, -17.1], [-180, -17.2]]],
-    ]}  # fmt: skip
-    beyond = {
-        "type": "Polygon",
-        "coordinates": [[[179.8, -17.2], [180.1, -17.2], [180.1, -17.1], [179.8, -17.1], [179.8, -17.2]]],
-    }
+
+    def ring(west: float, east: float) -> list[list[float]]:
+        return [[west, -17.2], [east, -17.2], [east, -17.1], [west, -17.1], [west, -17.2]]
+
+    cut = {"type": "MultiPolygon", "coordinates": [[ring(179.8, 180)], [ring(-180, -179.9)]]}
+    beyond = {"type": "Polygon", "coordinates": [ring(179.8, 180.1)]}
     found = []
     for name, text in (("cut", cut), ("beyond", beyond)):
         (tmp_path / f"{name}.geojson").write_text(json.dumps(text))
@@ -306,10 +298,7 @@ def test_a_terrain_across_180_degrees_has_zones_on_both_sides(tmp_path: Path) ->
     assert inside.sum() > 150
     np.testing.assert_array_equal(found[0], inside)
     np.testing.assert_array_equal(found[1], inside)
-    uncut = {
-        "type": "Polygon",
-        "coordinates": [[[179.8, -17.2], [-179.9, -17.2], [-179.9, -17.1], [179.8, -17.1], [179.8, -17.2]]],
-    }
+    uncut = {"type": "Polygon", "coordinates": [ring(179.8, -179.9)]}
     (tmp_path / "uncut.geojson").write_text(json.dumps(uncut))
     with pytest.raises(TerrainError, match=r"feature 0 cannot be used: an edge .* 180 degrees"):
         painted([ZoneConfig(kind="forbidden", file=str(tmp_path / "uncut.geojson"))], grid)

@@ -39,7 +39,8 @@ def test_a_class_that_says_nothing_is_the_scenario_itself() -> None:
 
 
 def test_a_written_scenario_has_the_same_classes(tmp_path: Path) -> None:
-    scenario = load_of(tmp_path, _TWO)
+    (tmp_path / "scenario.toml").write_text(_TWO)
+    scenario = load_scenario(tmp_path / "scenario.toml")
     (tmp_path / "again.toml").write_text(scenario_text(scenario, tmp_path))
     assert load_scenario(tmp_path / "again.toml") == scenario
 
@@ -56,8 +57,3 @@ def test_classes_keep_the_preset_of_the_common_cost() -> None:
 def test_an_unknown_class_is_said_with_those_there_are() -> None:
     with pytest.raises(ConfigError, match=r"has no class 'boat'.*ground"):
         of_class(Scenario(), "boat")
-
-
-def load_of(folder: Path, text: str) -> Scenario:
-    (folder / "scenario.toml").write_text(text)
-    return load_scenario(folder / "scenario.toml")

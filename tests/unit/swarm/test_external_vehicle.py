@@ -4,6 +4,7 @@ from pathlib import Path
 from unittest.mock import MagicMock
 
 import pytest
+from msgspec.structs import replace
 
 from swarm.errors import BusError, ConfigError, DamagedError, StoreError
 from swarm.grid import GridSpec
@@ -29,7 +30,15 @@ def leader_of(**of: object) -> Leader:
 
 def entering(name, cell, seq=1, ahead=None, generation=1 << 32):
     stand = Stand(f"{name}-00", cell, cell, Held(), ahead or [cell], [], 0, 0)
-    return HostState(shard=0, agent=name, generation=generation, seq=seq, knows=(0, 0), vehicles=[stand])
+    return state_of(name, [stand], seq, generation)
+
+
+def state_of(host: str, stands: list[Stand], seq: int, generation: int = 1 << 32) -> HostState:
+    return HostState(shard=0, agent=host, generation=generation, seq=seq, knows=(0, 0), vehicles=stands)
+
+
+def known(agent: str, generation: int, shards: list[int], agents: list[str], generations: list[int]) -> Known:
+    return Known(agent=agent, disk=0, generation=generation, shards=shards, agents=agents, generations=generations)
 
 
 def entered(cell: int = 70) -> tuple[ExternalVehicle, Leader]:
@@ -111,12 +120,9 @@ def test_a_session_whose_thread_has_failed_says_so_and_is_closed_all_the_same() 
 
 def test_a_host_may_speak_for_vehicles_of_its_own_name_only() -> None:
     leader = leader_of()
-    lie = entering("rover", 70)
     for vehicle in ("a1-00", "other-00", "rover2-00"):
         stand = Stand(vehicle, 70, 70, Held(), [70], [], 0, 0)
-        leader.take_host_state(
-            HostState(shard=0, agent="rover", generation=5, seq=lie.seq, knows=(0, 0), vehicles=[stand]), 0
-        )
+        leader.take_host_state(state_of("rover", [stand], seq=1, generation=5), 0)
         table = leader.tick(0)
         assert table is None or not table.grants
 
@@ -130,9 +136,7 @@ def test_no_external_vehicle_and_not_all_together_take_all_cells(monkeypatch: py
         end = held[-1][0]
         ahead = list(range(end + 1, end + 13))
         stand = Stand("rover-00", 0, end, Held.of(held), ahead, ahead[:1], 1, 0)
-        leader.take_host_state(
-            HostState(shard=0, agent="rover", generation=1 << 32, seq=seq, knows=(0, 0), vehicles=[stand]), 0
-        )
+        leader.take_host_state(state_of("rover", [stand], seq), 0)
         leader.tick(0)
     table = leader.tick(1 << 40)
     assert len(table.grants["rover-00"]) == leaders.MOST_CELLS
@@ -157,9 +161,7 @@ def test_a_shard_knows_so_many_external_vehicles_and_says_whom_it_refuses(monkey
     assert leader.refused == ["shard 0 has known 2 external vehicles: r2 cannot enter"]
     table = leader.tick(0)
     assert set(table.grants) == {"r0-00", "r1-00"}
-    leader.take_host_state(
-        HostState(shard=0, agent="a2", generation=1, seq=1, knows=(0, 0), vehicles=[]), 0
-    )  # of the scenario
+    leader.take_host_state(state_of("a2", [], seq=1, generation=1), 0)  # of the scenario
     assert len(leader.refused) == 1
 
 
@@ -169,15 +171,7 @@ def test_an_operator_frees_what_all_generations_of_an_external_vehicle_hold_and_
     generations = [77, leader._orders.hosts["rover"][0]]
     removal = Removal(SHARDS, "rover")
     for agent in SHARDS.agents:
-        known = Known(
-            agent=agent,
-            disk=0,
-            generation=generations[1],
-            shards=[0],
-            agents=list(SHARDS.agents),
-            generations=generations,
-        )
-        removal.hear_known(known)
+        removal.hear_known(known(agent, generations[1], [0], list(SHARDS.agents), generations))
     assert removal.known
     assert removal.host.informed
     removal.begin(3)
@@ -198,9 +192,7 @@ def test_an_operator_frees_what_all_generations_of_an_external_vehicle_hold_and_
     back = ExternalVehicle(SHARDS, "rover", [generations[1]])
     for agent in SHARDS.agents:
         generation, _ = leader._orders.hosts["rover"]
-        back.host.hear_known(
-            Known(agent=agent, disk=0, generation=generation, shards=[], agents=[], generations=[])
-        )
+        back.host.hear_known(known(agent, generation, [], [], []))
     back.enter(90)
     back.begin(9)
     talk(back, leader, 2_000_000_000)
@@ -222,17 +214,13 @@ def test_cells_shut_for_an_external_vehicle_are_opened_only_by_a_generation_that
     held = [(70, 1, 1), (71, 1, 1)]
     leader = leader_of(hosts={"rover": (1 << 40, 9)}, fences=[Fence("rover", 5, {"rover-00": Held.of(held)})])
     older = entering("rover", 70, generation=1 << 33)
-    leader.take_host_state(HostState(**{**fields_of(older), "dead": [5]}), 0)
+    leader.take_host_state(replace(older, dead=[5]), 0)
     assert leader._orders.fenced == {("rover", 5): {"rover-00": held}}
     leader.take_host_state(entering("a1", 71), 0)
     younger = entering("rover", 70, generation=(1 << 40) + 1)
-    leader.take_host_state(HostState(**{**fields_of(younger), "dead": [5]}), 0)
+    leader.take_host_state(replace(younger, dead=[5]), 0)
     table = leader.tick(0)
     assert [*table.grants["rover-00"]] == [(70, 1, 1)]
-
-
-def fields_of(standing: HostState) -> dict[str, object]:
-    return {name: getattr(standing, name) for name in standing.__struct_fields__}
 
 
 def test_generations_are_on_file_before_they_speak_and_one_process_has_the_file(tmp_path: Path) -> None:

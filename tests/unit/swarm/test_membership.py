@@ -21,11 +21,17 @@ class Node:
     """A process that is nothing but a member."""
 
     def __init__(self, world: SwarmModel, **changes: object) -> None:
+        self.world = world
         self.info = msgspec.structs.replace(INFO, **changes)
         self.bus = world.bus(self.info.id)
         self.member = Member(self.info, self.bus, self.post)
         self.rest: list[Event] = []
         self.failure: RunMismatchError | None = None
+
+    def join(self) -> None:
+        """Joins, and has all answers."""
+        self.member.join()
+        self.world.settle()
 
     def post(self, event: Event) -> None:
         try:
@@ -54,8 +60,7 @@ def world() -> SwarmModel:
 def test_members_of_one_run_get_along(members, world):
     nodes = [Node(world, **each) for each in members]
     for node in nodes:
-        node.member.join()
-        world.settle()
+        node.join()
     assert [node.failure for node in nodes] == [None] * len(nodes)
     assert ROUTER in members or not any(node.rest for node in nodes)
 
@@ -87,10 +92,8 @@ def test_members_of_one_run_get_along(members, world):
 )
 def test_one_that_does_not_belong_ends_with_a_sentence_and_the_others_go_on(changes, words, world):
     first, stranger = Node(world), Node(world, id="t1", **changes)
-    first.member.join()
-    world.settle()
-    stranger.member.join()
-    world.settle()
+    first.join()
+    stranger.join()
     assert str(stranger.failure).startswith(words)
     assert stranger.failure.exit_code == 5
     assert first.failure is None
@@ -110,8 +113,7 @@ def test_a_router_that_answers_first_hides_no_other_run():
 def test_of_two_that_start_at_once_at_least_one_notices(world):
     one, other = Node(world), Node(world, id="t1", run_id="r2")
     one.member.join()
-    other.member.join()
-    world.settle()
+    other.join()
     assert one.failure or other.failure
 
 
@@ -119,8 +121,7 @@ def test_who_meets_only_after_a_cut_heals_is_checked_then(world):
     one, other = Node(world), Node(world, id="t1", run_id="r2")
     world.cut(other.bus)
     one.member.join()
-    other.member.join()
-    world.settle()
+    other.join()
     assert one.failure is None
     assert other.failure is None
     world.heal(other.bus)
@@ -131,8 +132,7 @@ def test_who_meets_only_after_a_cut_heals_is_checked_then(world):
 
 def test_who_sees_a_router_appear_compares_anew_but_does_not_take_its_own_link_to_be_up(world):
     node = Node(world)
-    node.member.join()
-    world.settle()
+    node.join()
     routers, questions = world.bus("r"), []
     world.bus("counts").serve(RUN, questions.append, role="agent", id="x")
     for n in range(600):  # names cost a sender nothing
@@ -172,8 +172,7 @@ def test_once_somebody_has_confirmed_a_process_no_false_answer_ends_it_and_the_s
     world.bus("watcher").subscribe(NOTE, notes.append)
     nodes = [Node(world, id=id) for id in ("t0", "t1")]
     for node in nodes:
-        node.member.join()
-        world.settle()
+        node.join()
     liar = Node(world, role="agent", id="zz", run_id="another", terrain="bbbb")
     liar.bus.serve(RUN, liar.post, role="agent", id="zz")
     for turn in range(3):
@@ -190,10 +189,8 @@ def test_once_somebody_has_confirmed_a_process_no_false_answer_ends_it_and_the_s
 
 def test_a_process_that_starts_beside_a_stranger_joins_those_who_agree(world):
     first, liar = Node(world), Node(world, role="agent", id="zz", run_id="another")
-    first.member.join()
-    world.settle()
+    first.join()
     liar.bus.serve(RUN, liar.post, role="agent", id="zz")
     late = Node(world, id="t1")
-    late.member.join()
-    world.settle()
+    late.join()
     assert late.failure is None

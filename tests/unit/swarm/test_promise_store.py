@@ -29,19 +29,22 @@ def table(shard: int, seq: int) -> Table:
     return Table(shard=shard, agent="a0", epoch=3, seq=seq, hosts={}, grants={"a0-00": Held.of([(seq, 3, seq)])})
 
 
+def saved_in(path: Path) -> tuple[OwnRecord, dict[int, tuple[int, Table]]]:
+    """What the next generation finds."""
+    store = FilePromiseStore(path)
+    store.close()
+    return store.own, store.saved
+
+
 def test_what_was_saved_is_there_again(tmp_path: Path) -> None:
     store = FilePromiseStore(tmp_path / "run" / "promises-a0")
-    disk = store.own.disk
-    own = OwnRecord(disk=disk, generations=[7], noted={"a1": 5}, noted_by=["a1"])
+    own = OwnRecord(disk=store.own.disk, generations=[7], noted={"a1": 5}, noted_by=["a1"])
     store.save_own(own)
     for seq in range(3):
         store.save(3, table(0, seq))
     store.save(8, table(4, 1))
     store.close()
-    again = FilePromiseStore(tmp_path / "run" / "promises-a0")
-    assert again.own == own
-    assert again.saved == {0: (3, table(0, 2)), 4: (8, table(4, 1))}
-    again.close()
+    assert saved_in(tmp_path / "run" / "promises-a0") == (own, {0: (3, table(0, 2)), 4: (8, table(4, 1))})
 
 
 @pytest.mark.parametrize("gone", ["nothing", "the folder", "its place", "promises-a0.lock", "promises-a0.spare"])
@@ -61,9 +64,7 @@ def test_promises_go_on_and_stay_locked_whatever_is_moved_or_deleted(tmp_path: P
     with pytest.raises(StoreError, match="is in use by the same agent"):
         FilePromiseStore(path)
     store.close()
-    again = FilePromiseStore(path)
-    assert (again.own, again.saved) == (store.own, {0: (3, table(0, 11_999))})
-    again.close()
+    assert saved_in(path) == (store.own, {0: (3, table(0, 11_999))})
 
 
 @pytest.mark.parametrize("written", [0, 1, 20, -1], ids=["nothing", "a byte", "a part", "all but a byte"])
@@ -84,9 +85,8 @@ def test_a_record_that_a_kill_cut_short_is_left_out(tmp_path: Path, written: int
     assert again.saved == {0: (3, table(0, 1))}
     again.save(4, Table(shard=1, agent="a0", epoch=4, seq=1, hosts={}, grants={}))  # a shorter one
     again.close()
-    third = FilePromiseStore(path)
-    assert {shard: promised for shard, (promised, _) in third.saved.items()} == {0: 3, 1: 4}
-    third.close()
+    _, saved = saved_in(path)
+    assert {shard: promised for shard, (promised, _) in saved.items()} == {0: 3, 1: 4}
 
 
 def test_a_sync_covers_all_records_before_it_and_without_any_it_asks_nothing_of_the_disk(tmp_path, monkeypatch):
@@ -127,9 +127,8 @@ def test_promises_that_were_synced_survive_a_kill_at_any_instant(tmp_path: Path)
             time.sleep(chance.uniform(0, 0.003))
             agent.kill()
             acknowledged = max([acknowledged, *map(int, agent.stdout.read().split())])
-        store = FilePromiseStore(tmp_path / "promises-a0")
-        assert min(promised for promised, _ in store.saved.values()) >= acknowledged
-        store.close()
+        _, saved = saved_in(tmp_path / "promises-a0")
+        assert min(promised for promised, _ in saved.values()) >= acknowledged
 
 
 def test_one_that_waits_goes_on_with_what_the_generation_before_has_left(tmp_path: Path) -> None:
@@ -171,9 +170,8 @@ def test_a_file_that_is_full_is_written_anew(tmp_path: Path, monkeypatch: pytest
         assert path.stat().st_size == 3000
         assert store.ready
     store.close()
-    again = FilePromiseStore(path)
-    assert {shard: saved.seq for shard, (_, saved) in again.saved.items()} == {0: 198, 1: 199, 2: 197}
-    again.close()
+    _, found = saved_in(path)
+    assert {shard: saved.seq for shard, (_, saved) in found.items()} == {0: 198, 1: 199, 2: 197}
 
 
 def test_what_counts_may_grow_beyond_the_size_that_a_file_begins_with(tmp_path, monkeypatch):
@@ -183,9 +181,8 @@ def test_what_counts_may_grow_beyond_the_size_that_a_file_begins_with(tmp_path, 
         store.save(3, table(shard, shard))
         assert store.ready
     store.close()
-    again = FilePromiseStore(tmp_path / "promises-a0")
-    assert {shard: saved.seq for shard, (_, saved) in again.saved.items()} == {n: n for n in range(300)}
-    again.close()
+    _, found = saved_in(tmp_path / "promises-a0")
+    assert {shard: saved.seq for shard, (_, saved) in found.items()} == {n: n for n in range(300)}
 
 
 class Disk:

@@ -197,28 +197,19 @@ def test_the_first_to_start_does_not_wait_for_anybody() -> None:
 # --- where they start ---------------------------------------------------------------------------------------
 
 
+ROCK = [*OPEN[:3], "...#" + "." * 16, *OPEN[4:]]
+
+
 @pytest.mark.parametrize(
-    ("cell", "words"),
+    ("text", "picture", "agent", "words"),
     [
-        ((30, 2), r"groups: all: cell is \[30, 2\], outside the terrain: 20 x 20 cells"),
-        ((3, 3), r"groups: all: cell:3,3 .* is lethal; choose a passable cell"),
+        (scenario(1, [(30, 2)]), ROCK, "a0", r"groups: all: cell is \[30, 2\], outside the terrain: 20 x 20 cells"),
+        (scenario(1, [(3, 3)]), ROCK, "a0", r"groups: all: cell:3,3 .* is lethal; choose a passable cell"),
+        (scenario(10), ["..."] * 3, "a0", "10 vehicles, but only 9 connected passable cells"),
+        (scenario(2), OPEN, "a7", "has no agent a7"),
     ],
 )
-def test_an_impossible_place_is_refused_in_a_sentence(cell: tuple[int, int], words: str) -> None:
-    pace = pace_of(OPEN)
-    pace[3, 3] = np.inf
-    world = AgentWorld(scenario(1, [cell]), pace)
+def test_an_agent_that_cannot_start_is_refused_in_a_sentence(text: str, picture: list[str], agent: str, words: str):
+    world = AgentWorld(text, pace_of(picture))
     with pytest.raises(ConfigError, match=words):
-        world.start_agent("a0")
-
-
-def test_more_vehicles_than_cells_are_refused() -> None:
-    world = AgentWorld(scenario(10), pace_of(["..."] * 3))
-    with pytest.raises(ConfigError, match="10 vehicles, but only 9 connected passable cells"):
-        world.start_agent("a0")
-
-
-def test_an_agent_that_the_scenario_does_not_have_is_refused() -> None:
-    world = AgentWorld(scenario(2), pace_of(OPEN))
-    with pytest.raises(ConfigError, match="has no agent a7"):
-        world.start_agent("a7")
+        world.start_agent(agent)

@@ -31,6 +31,11 @@ class ClosedWorld(AgentWorld):
         self._closed = {row * cols + col for row in range(row0, row1) for col in range(col0, col1)}
         self._inside = {vehicle.id: vehicle.cell for vehicle in self.vehicles() if vehicle.cell in self._closed}
 
+    def assert_all_leave(self) -> None:
+        self.until(lambda: not self._inside, within_s=30)
+        assert self.entered == []
+        self.assert_lawful()
+
     def _watch_borders(self) -> None:
         inside = {vehicle.id: vehicle.cell for vehicle in self.vehicles() if vehicle.cell in self._closed}
         self.entered += inside.keys() - self._inside.keys() if self._closed else ()
@@ -66,9 +71,7 @@ def test_inflated_borders_of_a_zone_are_left_too_and_walls_are_not_crossed() -> 
     world = ClosedWorld(scenario(2, [(8, 9), (9, 11)], per_agent=1), pace_of(picture)).begin(t=(8, 19))
     world.run(0.5)
     world.close(5, 6, 13, 15)
-    world.until(lambda: not world._inside, within_s=30)
-    assert world.entered == []
-    world.assert_lawful()
+    world.assert_all_leave()
 
 
 def test_a_way_out_does_not_lead_over_ground_that_is_seen_to_be_lethal() -> None:
@@ -80,9 +83,7 @@ def test_a_way_out_does_not_lead_over_ground_that_is_seen_to_be_lethal() -> None
     world = ClosedWorld(scenario(1, [(14, 10)], per_agent=1), pace_of(OPEN), truth=pace_of(truth)).begin(t=(14, 10))
     world.run(0.5)
     world.close(6, 0, 20, 20)
-    world.until(lambda: not world._inside, within_s=30)
-    assert world.entered == []
-    world.assert_lawful()
+    world.assert_all_leave()
 
 
 def test_a_way_out_leads_around_an_obstacle_that_stands_on_the_nearest() -> None:
