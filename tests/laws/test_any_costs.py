@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from support import slow_twins as naive
 from support.effort import few
 from support.fields import make_field, paces_of_any_ratio
-from support.kernel_oracle import inner
+from support.kernel_oracle import inner, loaded
 from support.planner_strategies import RULES, STRATEGIES
 
 from planner_service.kernels.cell_costs import CHEAPEST_S, DEAREST_S
@@ -69,8 +69,7 @@ def test_trees_over_costs_of_any_ratio_are_right_to_the_last_bit(field: str) -> 
     pace = make_field(field, 64)
     for number, (_, paces) in enumerate(paces_of_any_ratio(pace, np.random.default_rng(1))):
         rules = RULES[number % len(RULES)]
-        ground = CostGrid(GridSpec(64, 64, 1.0), PlannerConfig(**rules))
-        ground.load(paces)
+        ground = loaded(paces, **rules)
         tree = CostToGoTree(ground)
         target = int(np.flatnonzero(np.isfinite(paces))[1500])
         tree.grow(target)
@@ -94,8 +93,7 @@ def test_a_tree_is_exact_on_any_paces_after_any_marks(
     target = int(rng.integers(rows * cols))
     with warnings.catch_warnings(), np.errstate(all="raise", under="ignore"):
         warnings.simplefilter("error")
-        ground = CostGrid(GridSpec(rows, cols, resolution_m), PlannerConfig(length_weight=weight, **rules))
-        ground.load(pace)
+        ground = loaded(pace, GridSpec(rows, cols, resolution_m), length_weight=weight, **rules)
         tree = CostToGoTree(ground)
         for _ in range(data.draw(st.integers(1, 4))):
             costs = inner(tree, ground.cell_cost)

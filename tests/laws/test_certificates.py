@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 from support.effort import few
-from support.kernel_oracle import inner
+from support.kernel_oracle import inner, loaded
 from support.planner_strategies import random_pace
 from support.slow_twins import lower_bound
 from support.tree_lives import Findings, Life, lives
@@ -89,8 +89,7 @@ def slow_rest(tree: CostToGoTree, cell: int) -> float:
 def a_tree(seed: int, length_weight: float = 0.0) -> tuple[CostToGoTree, NDArray[np.float32]]:
     pace = random_pace(np.random.default_rng(seed), GRID.rows, GRID.cols, 30.0, 0.25)
     pace[20, 30] = 1.0
-    costs = CostGrid(GRID, PlannerConfig(length_weight=length_weight))
-    costs.load(pace)
+    costs = loaded(pace, GRID, length_weight=length_weight)
     tree = CostToGoTree(costs)
     tree.grow(GRID.cell(20, 30))
     return tree, pace
@@ -207,8 +206,7 @@ def most_steps(costs: CostGrid, cost_s: float) -> int:
 def test_no_way_is_taken_for_shorter_than_it_may_be_nor_for_much_longer(seed: int) -> None:
     rng = np.random.default_rng(seed)
     pace = random_pace(rng, 30, 30, 1e4, 0.2)
-    costs = CostGrid(GridSpec(30, 30, 1.0), PlannerConfig())
-    costs.load(pace)
+    costs = loaded(pace)
     for _ in range(6):
         for cost_s in (0.5, 3.0, 40.0, 1e3, 1e9):
             steps = costs.rounding.at(np.array([cost_s]))[0] * 2**24 - 8
@@ -218,8 +216,7 @@ def test_no_way_is_taken_for_shorter_than_it_may_be_nor_for_much_longer(seed: in
         snapshot, before = costs.snapshot(), costs.rounding.at(np.array([40.0]))
         costs.apply(pace, [Window(row, col, row + 5, col + 5)])
         np.testing.assert_array_equal(snapshot.rounding.at(np.array([40.0])), before)
-        anew = CostGrid(GridSpec(30, 30, 1.0), PlannerConfig())
-        anew.load(pace)
+        anew = loaded(pace)
         np.testing.assert_array_equal(anew.rounding.classes, costs.rounding.classes)
 
 

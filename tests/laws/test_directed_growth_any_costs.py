@@ -8,7 +8,7 @@ from collections.abc import Callable
 import numpy as np
 import pytest
 from support import slow_twins as naive
-from support.kernel_oracle import inner
+from support.kernel_oracle import inner, loaded
 from support.planner_strategies import RULES, random_climb, random_pace
 
 from planner_service.kernels.layout import NONE
@@ -96,8 +96,7 @@ def test_no_costs_make_a_growth_many_times_as_long() -> None:
 
     def grow(draw: Paces) -> Callable[[], float]:
         rng = np.random.default_rng(1)
-        costs = CostGrid(climb.grid, PlannerConfig(), climb)
-        costs.load(draw(rng, 64, 64))
+        costs = loaded(draw(rng, 64, 64), climb.grid, climb)
         labels = np.empty(costs.size, np.float32), np.full(costs.size, NONE, np.uint8)
         root = int(rng.choice(np.flatnonzero(np.isfinite(costs.cell_cost))))
 

@@ -3,12 +3,11 @@
 import numpy as np
 import pytest
 from support import slow_twins as naive
-from support.kernel_oracle import WALLS
+from support.kernel_oracle import WALLS, loaded
 from support.planner_strategies import RULES, random_climb, random_pace
 
 from planner_service.goal_tree_cache import GoalTrees
 from planner_service.target_tree import TargetTree
-from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.partial_growth import PartialGrowth
 from shared_map.terrain.step_climb import Climb
 from swarm.config.scenario import PlannerConfig
@@ -17,12 +16,6 @@ from swarm.grid import GridSpec, Window, walk
 from swarm.wire.route_columns import RouteStatus
 
 ROUNDING = 1e-5
-
-
-def loaded(pace: np.ndarray, rules: dict, climb: Climb | None = None) -> CostGrid:
-    ground = CostGrid(GridSpec(*pace.shape, 1.0), PlannerConfig(**rules), climb)
-    ground.load(pace)
-    return ground
 
 
 def open_cell(rng: np.random.Generator, pace: np.ndarray) -> int:
@@ -47,7 +40,7 @@ def test_a_growth_that_stops_is_exact_where_it_was_and_bounds_the_rest(rules: di
     rng = np.random.default_rng(1)
     for n in range(60):
         pace = random_pace(rng, *rng.integers(2, 40, 2), (1.0, 3.0, 40.0, 900.0)[n % 4], WALLS[n % 4])
-        ground, goal = loaded(pace, rules), open_cell(rng, pace)
+        ground, goal = loaded(pace, **rules), open_cell(rng, pace)
         best = naive.cost_to_go(pace, goal, **rules).reshape(-1)
         growth, bucket = PartialGrowth(ground), ground.lowest_cell_cost
         growth.begin(ground.pad(goal))
@@ -101,7 +94,7 @@ def test_lives_of_goals_on_a_map_that_changes_are_answered_as_by_dijkstra(kind: 
         rules, ratio = RULES[n % 5], {"narrow": (1.3, 6.0, 300.0)[n % 3], "wide": 1e5, "directed": 5.0}[kind]
         pace = random_pace(rng, *rng.integers(4, 34, 2), ratio, WALLS[n % 4])
         climb = random_climb(rng, GridSpec(*pace.shape, 1.0), 0.3, 0.9) if kind == "directed" else None
-        ground = loaded(pace, rules, climb)
+        ground = loaded(pace, climb=climb, **rules)
         trees = GoalTrees(ground, int(rng.choice([0, 6_000, 1 << 30])))
         goals = [open_cell(rng, pace) for _ in range(3)]
         for _ in range(25):
@@ -141,7 +134,7 @@ def test_lives_of_goals_on_a_map_that_changes_are_answered_as_by_dijkstra(kind: 
 def test_who_asks_again_after_every_slice_is_answered_however_small_the_slices_and_the_cache_are() -> None:
     pace = random_pace(np.random.default_rng(3), 20, 20, 4.0, 0.1)
     pace.flat[[0, 19, 399]] = 1.0
-    trees = GoalTrees(loaded(pace, RULES[0]), 10_000)
+    trees = GoalTrees(loaded(pace, **RULES[0]), 10_000)
     asks = 0
     left = {(0, 399), (19, 399), (399, 0)}
     while left:
@@ -154,7 +147,7 @@ def test_who_asks_again_after_every_slice_is_answered_however_small_the_slices_a
 
 def test_far_changes_and_dear_ones_beside_the_route_need_no_growth() -> None:
     pace = np.ones((60, 60), np.float32)
-    ground = loaded(pace, RULES[0])
+    ground = loaded(pace, **RULES[0])
     trees = GoalTrees(ground, 1 << 30)
     goal, start = 30 * 60 + 10, 30 * 60 + 25
     grown = trees.ask(goal, start, 1 << 40)

@@ -7,15 +7,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from support.kernel_oracle import inner
+from support.kernel_oracle import inner, loaded
 from support.slow_twins import cost_to_go
 
-from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
 from shared_map.terrain.slope_rules import directional_factor
 from swarm.config.ground import CostConfig
-from swarm.config.scenario import PlannerConfig
-from swarm.grid import GridSpec
 
 pytestmark = pytest.mark.skipif(shutil.which("grass") is None, reason="needs GRASS: apt-get install grass-core")
 SIDE_M = 10.0
@@ -62,8 +59,7 @@ def test_costs_to_go_equal_those_of_grass_on_the_same_file(tmp_path: Path) -> No
         there = np.isfinite(pace) & np.isfinite(mean)
         assert there.sum() > 3000
         np.testing.assert_allclose(theirs[there], mean[there], rtol=1e-4)
-        costs = CostGrid(GridSpec(*pace.shape, 1.0), PlannerConfig(corner_cutting=True))
-        costs.load(pace)
+        costs = loaded(pace, corner_cutting=True)
         tree = CostToGoTree(costs)
         tree.grow(root)
         entered = theirs if pace is even else cost_to_go(pace, root, corner_cutting=True)

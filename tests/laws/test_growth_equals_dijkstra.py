@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from support import slow_twins as naive
-from support.kernel_oracle import RATIOS, assert_equals_dijkstra, grown, random_grids
+from support.kernel_oracle import RATIOS, assert_equals_dijkstra, grown, loaded, random_grids
 from support.planner_strategies import RULES, random_pace
 
 from planner_service.kernels import queue_dial, queue_wide_buckets
@@ -46,8 +46,7 @@ def test_buckets_and_wide_buckets_give_the_same_costs_to_the_last_bit(rules: dic
     for ratio in (1.0, 50.0, 2000.0):
         pace = random_pace(rng, 260, 259, ratio, 0.2)
         target = int(np.flatnonzero(np.isfinite(pace))[0])
-        ground = CostGrid(GridSpec(*pace.shape, 1.0), PlannerConfig(**rules))
-        ground.load(pace)
+        ground = loaded(pace, **rules)
         root, width = ground.pad(target), 0.98 * ground.lowest_cell_cost
         narrow, wide = np.empty(ground.size, np.float32), np.empty(ground.size, np.float32)
         scratch = queue_dial.make_scratch(ground.size, ground.rule, 4096)

@@ -2,8 +2,10 @@
 
 By hand, more: MAP_MUTATIONS=1000000 pytest tests/laws/test_map_fuzz.py"""
 
+import contextlib
 import os
 import random
+from typing import TypeVar
 
 import msgspec
 import numpy as np
@@ -20,6 +22,7 @@ from swarm.wire.messages.map_data import DIGEST_ROW, Digest, MarkKind, MarkSet, 
 from swarm.wire.topics import DIGEST, MARKS
 
 MUTATIONS = int(os.environ.get("MAP_MUTATIONS", "20000"))
+M = TypeVar("M", MarkSet, MarkSets)
 FEW = MarksRequest(authors=["a1.1"], tiles=[0, 1])
 
 
@@ -49,15 +52,17 @@ def mutated(payload: bytes, chance: random.Random) -> bytes:
     return bytes(garbled)
 
 
-def test_mutated_sets_merge_by_the_rules_or_not_at_all() -> None:
-    chance = random.Random(4)
-    payloads = [encode(each) for each in examples()]
-    through: list[MarkSet] = []
+def survivors(payloads: list[bytes], kind: type[M], chance: random.Random) -> list[M]:
+    """Messages of mutated payloads, of those that are still messages."""
+    through: list[M] = []
     for _ in range(MUTATIONS):
-        try:
-            through.append(decode(mutated(chance.choice(payloads), chance), MarkSet))
-        except ProtocolError:
-            continue
+        with contextlib.suppress(ProtocolError):
+            through.append(decode(mutated(chance.choice(payloads), chance), kind))
+    return through
+
+
+def test_mutated_sets_merge_by_the_rules_or_not_at_all() -> None:
+    through = survivors([encode(each) for each in examples()], MarkSet, random.Random(4))
     assert len(through) > MUTATIONS // 100, "too few came through to say anything"
     replicas = []
     for order in (through, through[::-1]):
@@ -73,14 +78,8 @@ def test_mutated_sets_merge_by_the_rules_or_not_at_all() -> None:
 
 
 def test_mutated_messages_of_many_sets_merge_by_the_rules_or_not_at_all() -> None:
-    chance = random.Random(6)
-    payloads = [encode(message) for message in packed(examples())]
-    through: list[MarkSet] = []
-    for _ in range(MUTATIONS):
-        try:
-            through.extend(unpacked(decode(mutated(chance.choice(payloads), chance), MarkSets)))
-        except ProtocolError:
-            continue
+    messages = survivors([encode(message) for message in packed(examples())], MarkSets, random.Random(6))
+    through = [each for message in messages for each in unpacked(message)]
     assert len(through) > MUTATIONS // 100, "too few came through to say anything"
     singly, together = MapReplica(GRID, Composite()), MapReplica(GRID, Composite())
     for each in through:

@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support import slow_twins as naive
 from support.effort import few
-from support.kernel_oracle import inner
+from support.kernel_oracle import inner, loaded
 from support.planner_play import Play
 from support.planner_strategies import RULES, Job, Marks, Move, happenings, random_climb, random_pace
 
@@ -186,8 +186,7 @@ def test_where_nothing_is_left_of_the_old_order_mending_gives_up_and_says_so() -
     way."""
     rng = np.random.default_rng(3)
     pace = random_pace(rng, 60, 60, 100.0, 0.1)
-    costs = CostGrid(GridSpec(60, 60, 1.0), PlannerConfig())
-    costs.load(pace)
+    costs = loaded(pace)
     root = int(rng.choice(np.flatnonzero(np.isfinite(pace))))
     tree = CostToGoTree(costs)
     given_up = 0
@@ -212,8 +211,7 @@ def test_where_nothing_is_left_of_the_old_order_mending_gives_up_and_says_so() -
 def test_a_tree_whose_costs_are_too_large_for_its_parents_to_be_trusted_is_not_mended() -> None:
     pace = np.ones((30, 30), np.float32)
     pace[:, 15] = 1e9
-    costs = CostGrid(GridSpec(30, 30, 1.0), PlannerConfig())
-    costs.load(pace)
+    costs = loaded(pace)
     tree = CostToGoTree(costs)
     tree.grow(0)
     with pytest.raises(ValueError, match="grow the tree"):

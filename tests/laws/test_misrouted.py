@@ -86,14 +86,18 @@ def test_topics_that_share_a_message_are_known():
 # --- the simulated network confuses prefixes at reconnects, as routers do ---------
 
 
+@pytest.fixture
+def world() -> SwarmModel:
+    return SwarmModel()
+
+
 def confused(world: SwarmModel, bus, one: str, other: str) -> None:
     """Makes one prefix of a bus stand for another."""
     until_ns = world.scheduler.clock.now_ns() + SWAPPED_NS
     bus.swap = Swap({one: other, other: one}, MOST_SWAPPED, until_ns)
 
 
-def test_a_pose_that_comes_as_a_true_pose_is_not_believed():
-    world = SwarmModel()
+def test_a_pose_that_comes_as_a_true_pose_is_not_believed(world):
     a, b, poses = world.bus("a"), world.bus("b"), Box()
     b.subscribe(POSE, poses)
     b.collect(TRUE_POSE)
@@ -111,8 +115,7 @@ def test_a_pose_that_comes_as_a_true_pose_is_not_believed():
     assert poses == [Heard(POSE, {"target": "t0"}, pose())]
 
 
-def test_a_question_that_comes_to_another_queryable_is_refused_and_not_acted_on():
-    world = SwarmModel()
+def test_a_question_that_comes_to_another_queryable_is_refused_and_not_acted_on(world):
     a, b, routes, costs = world.bus("a"), world.bus("b"), Box(), Box()
     b.serve(ROUTE, routes, target="t0")
     b.serve(COST, costs, target="t0")
@@ -126,8 +129,7 @@ def test_a_question_that_comes_to_another_queryable_is_refused_and_not_acted_on(
     assert not costs.of(Asked)
 
 
-def test_a_question_whose_wrong_key_has_no_queryable_ends_without_an_answer():
-    world = SwarmModel()
+def test_a_question_whose_wrong_key_has_no_queryable_ends_without_an_answer(world):
     a, b = world.bus("a"), world.bus("b")
     b.serve(RUN, answering((run_info(id="b"), {})), role="agent", id="b")
     b.serve(STATS, Box(), role="agent")
@@ -135,8 +137,7 @@ def test_a_question_whose_wrong_key_has_no_queryable_ends_without_an_answer():
     assert asked(world, a, RUN, Nothing(), role="agent", id="b") == [AskEnded("q", RUN, 0, None)]
 
 
-def test_each_reconnect_confuses_two_prefixes_for_a_while_only():
-    world = SwarmModel()
+def test_each_reconnect_confuses_two_prefixes_for_a_while_only(world):
     a, b, heard = world.bus("a"), world.bus("b"), Box()
     for topic in (NOTE, STATS):
         b.subscribe(topic, heard)

@@ -9,14 +9,13 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from support.effort import few
-from support.shard_tables import grants_of, holdings_of
+from support.shard_tables import granted_cells, holdings_of
 
 from swarm.clock import NS_PER_S
 from swarm.config.agent_plan import plan_agents
 from swarm.config.load import parse_scenario
 from swarm.grid import GridSpec
 from swarm.right_of_way.shards import Shards
-from swarm.wire.messages.traffic import Granted
 from swarm.wire.messages.vehicles import Obstacle
 from vehicle_agent.agent import Agent
 from vehicle_agent.agent_maps import LocalMap
@@ -199,8 +198,7 @@ def agent_at(cells: list[int]) -> Agent:
 
 
 def grant(agent: Agent, seq: int, cells: dict[str, list[int]]) -> None:
-    leader, grants = SHARDS.leader(0, 1), grants_of(agent.holdings, seq, cells)
-    granted = Granted(shard=0, host="a0", agent=leader, epoch=1, seq=seq, generation=1, heard=seq, grants=grants)
+    granted = granted_cells(agent.holdings, SHARDS.leader(0, 1), seq, cells)
     agent.place(agent.holdings.hear_granted(granted, seq))
 
 

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from support import slow_twins as naive
 from support.effort import few
-from support.kernel_oracle import unpadded
+from support.kernel_oracle import loaded, unpadded
 from support.planner_play import Play
 from support.planner_strategies import RULES, random_pace
 
@@ -40,8 +40,7 @@ class Chase:
         self.pace = random_pace(rng, rows, cols, ratio, walls)
         if seed % 4 == 3:
             self.pace[:] = np.where(np.isfinite(self.pace), np.float32(1.1), np.inf)  # many ways cost the same
-        self.ground = CostGrid(GridSpec(rows, cols, 1.0), PlannerConfig(**self.rules))
-        self.ground.load(self.pace)
+        self.ground = loaded(self.pace, **self.rules)
         self.cells = self.ground.pad_all(np.arange(rows * cols))
         with mock.patch.object(pieces, "MOST_KEPT", (1, 2, 5, 1024)[seed // 2 % 4]):
             self.tree = PartitionedTree(self.ground)  # what it says must not hang on what it has kept
@@ -278,8 +277,7 @@ def test_ways_closed_all_over_the_map(seed: int) -> None:
     rng = np.random.default_rng(seed)
     chase = Chase(4 * seed + 1, 30)
     chase.pace = random_pace(rng, rows, cols, 4.0, 0.1)
-    chase.ground = CostGrid(GridSpec(rows, cols, 1.0), PlannerConfig(**chase.rules))
-    chase.ground.load(chase.pace)
+    chase.ground = loaded(chase.pace, **chase.rules)
     chase.cells = chase.ground.pad_all(np.arange(chase.pace.size))
     chase.tree = PartitionedTree(chase.ground)
     chase.grow(int(rng.choice(np.flatnonzero(np.isfinite(chase.pace)))))

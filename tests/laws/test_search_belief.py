@@ -8,7 +8,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from support.effort import few
-from support.kernel_oracle import inner
+from support.kernel_oracle import inner, loaded
 
 from planner_service.search.belief import Belief, blocks_of
 from planner_service.search.search_places import IDLE_S, Searcher, Ways
@@ -16,7 +16,6 @@ from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
 from shared_map.terrain.step_climb import Climb, climb_of
 from swarm.config.ground import CostConfig
-from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec, Window, walk
 from swarm.wire.route_columns import RouteStatus
 
@@ -36,9 +35,7 @@ def _pace(rows: int, cols: int, seed: int) -> NDArray[np.float32]:
 
 
 def costs_of(pace: NDArray[np.float32], climb: Climb | None = None) -> CostGrid:
-    costs = CostGrid(GridSpec(*pace.shape, METRES), PlannerConfig(), climb)
-    costs.load(pace)
-    return costs
+    return loaded(pace, GridSpec(*pace.shape, METRES), climb)
 
 
 def begun(

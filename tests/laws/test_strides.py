@@ -11,17 +11,15 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
 from support import slow_twins as naive
-from support.kernel_oracle import inner, unpadded
+from support.kernel_oracle import inner, loaded, unpadded
 from support.planner_strategies import RULES, random_pace
 
 from planner_service.kernels import stride_growth
 from planner_service.kernels.stride_growth import StrideNetwork
 from planner_service.tree import cost_to_go, strides
-from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
 from planner_service.tree.strides import find_strides
-from swarm.config.scenario import PlannerConfig
-from swarm.grid import STEP_COL, STEP_ROW, GridSpec
+from swarm.grid import STEP_COL, STEP_ROW
 
 Labels = NDArray[np.int64]
 
@@ -47,8 +45,7 @@ class Ground:
         if not np.isfinite(pace).any():
             pace[0, 0] = 1.0
         self.rng, self.pace, self.rules = rng, pace, rules
-        self.costs = CostGrid(GridSpec(rows, cols, 1.0), PlannerConfig(**rules))
-        self.costs.load(pace)
+        self.costs = loaded(pace, **rules)
         self.network = find_strides(self.costs)
         self.steps = naive.steps(pace, **rules)
 

@@ -12,13 +12,12 @@ from hypothesis import strategies as st
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import dijkstra
 from support.effort import few
-from support.kernel_oracle import inner
+from support.kernel_oracle import inner, loaded
 from support.segments import crossed
 
 from planner_service.any_angle_routes import Puller
 from planner_service.route_finder import RouteFinder
 from planner_service.search.search_places import Ways
-from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
 from shared_map.terrain.air import AirGround, air_ground
 from shared_map.terrain.step_climb import STILL, Wind, wind_of
@@ -132,8 +131,7 @@ def test_trees_and_ways_back_in_wind_are_scipys_over_the_wind_triangle(
 ) -> None:
     flown = flown_over(ground, wind)
     edges = twin_edges(flown, wind)
-    costs = CostGrid(flown.climb.grid, PlannerConfig(), flown.climb)
-    costs.load(flown.pace_s_per_m)
+    costs = loaded(flown.pace_s_per_m, flown.climb.grid, flown.climb)
     tree = CostToGoTree(costs)
     tree.grow(0)
     to_target = dijkstra(edges.T, indices=0)

@@ -10,6 +10,7 @@ from support.planner_strategies import RULES, random_pace
 
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
+from shared_map.terrain.step_climb import Climb
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import STEP_COL, STEP_ROW, GridSpec
 
@@ -29,10 +30,15 @@ def unpadded(cost_grid: CostGrid, padded: np.ndarray) -> np.ndarray:
     return (rows - 1) * cost_grid.grid.cols + cols - 1
 
 
+def loaded(pace: np.ndarray, grid: GridSpec | None = None, climb: Climb | None = None, **config: Any) -> CostGrid:
+    """The costs of a map of paces, on cells of a metre where no grid is given, under the rules of the planner."""
+    costs = CostGrid(grid or GridSpec(*pace.shape, 1.0), PlannerConfig(**config), climb)
+    costs.load(pace)
+    return costs
+
+
 def grown(pace: np.ndarray, target: int, rules: dict[str, Any]) -> CostToGoTree:
-    ground = CostGrid(GridSpec(pace.shape[0], pace.shape[1], 1.0), PlannerConfig(**rules))
-    ground.load(pace)
-    tree = CostToGoTree(ground)
+    tree = CostToGoTree(loaded(pace, **rules))
     tree.grow(target)
     return tree
 

@@ -103,7 +103,7 @@ class Ear:
 
 
 def planning(world: SwarmModel, role: str, id: str, incarnation: int = 1) -> Callable[[MemoryBus, Post], Planning]:
-    """Makes the common part of a process that plans; its worker runs on the world's scheduler."""
+    """A maker of the common part of a process that plans; its worker runs on the world's scheduler."""
     setup, worker = world.setup(role, id, incarnation), InlineWorker(world.scheduler)
     return lambda bus, post: Planning(setup, world.terrain, bus, post, worker)
 

@@ -69,14 +69,15 @@ def granted_of(table: Table, host: str = "a0") -> Granted:
     )  # fmt: skip
 
 
-def grants_of(holdings: Holdings, seq: int, cells: Mapping[str, Sequence[int]]) -> dict[str, Held]:
-    """Entries of cells: those that a vehicle holds, and new ones of table (1, seq)."""
+def granted_cells(holdings: Holdings, leader: str, seq: int, cells: Mapping[str, Sequence[int]]) -> Granted:
+    """A leader's grant of cells to vehicles of a0: entries that they hold, and new ones of table (1, seq)."""
     paths = holdings._entries.paths
     held = {vehicle: {entry.cell: entry.number for entry in path} for vehicle, path in paths.items()}
-    return {
+    grants = {
         vehicle: Held.of([held.get(vehicle, {}).get(cell, (cell, 1, seq)) for cell in each])
         for vehicle, each in cells.items()
     }
+    return Granted(shard=0, host="a0", agent=leader, epoch=1, seq=seq, generation=1, heard=seq, grants=grants)
 
 
 def hear(holdings: Holdings, table: Table, now_ns: int = 0) -> None:

@@ -47,7 +47,7 @@ class World(SwarmModel):
         return self.start(name, lambda bus, post: PlannerService(plans(bus, post)), phase_ns=0)
 
     def sight(self, author: str, age_s: int, cell: int) -> None:
-        """Publishes that an author has seen the target."""
+        """Publishes a sighting of the target, under the name of this author."""
         stamp_ns = self.now_ns - age_s * NS_PER_S
         sighted = Sighted(
             author=author, group="all", target="h", seq=1, stamp_ns=stamp_ns, until_ns=stamp_ns + 30 * NS_PER_S,

@@ -3,10 +3,9 @@
 import numpy as np
 import pytest
 from support import slow_twins as naive
+from support.kernel_oracle import loaded
 
 from planner_service.search.search_places import Ways
-from planner_service.tree.cost_grid import CostGrid
-from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec
 
 
@@ -15,8 +14,7 @@ def test_arrivals_are_the_cheapest_ways_out_and_the_bound_of_large_maps_is_below
     chance = np.random.default_rng(seed)
     pace = chance.uniform(0.02, 1.0, (24, 31)).astype(np.float32)
     pace[chance.random(pace.shape) < 0.2] = np.inf
-    costs = CostGrid(GridSpec(*pace.shape, 10.0), PlannerConfig(corner_cutting=True))
-    costs.load(pace)
+    costs = loaded(pace, GridSpec(*pace.shape, 10.0), corner_cutting=True)
     start = int(chance.choice(np.flatnonzero(np.isfinite(pace))))
     # Ways out are ways in turned round, on which a step has the pace of the cell that it leaves.
     exact = 10.0 * naive.cost_to_go(pace, start, corner_cutting=True, left_share=1.0)

@@ -27,12 +27,6 @@ def some_sets(count: int = 5) -> list[MarkSet]:
     return [set_of("a", tile, 1, {tile: (LETHAL, 0, 10 + tile)}) for tile in range(count)]
 
 
-def fill(store: KeeperStore) -> None:
-    """Makes the next page that the store needs one too many: a full disk."""
-    pages = store._db.execute("PRAGMA page_count").fetchone()[0]
-    store._db.execute(f"PRAGMA max_page_count = {pages}")
-
-
 def test_what_was_saved_is_there_again(tmp_path: Path) -> None:
     path = tmp_path / "deep" / "map.sqlite"
     with KeeperStore(path) as store:
@@ -229,7 +223,10 @@ def test_a_full_disk_is_told_of_and_the_keeper_goes_on_serving_and_saves_when_th
     keeper = swarm.keeper("keeper", store)
     author = swarm.writer("a1.1")
     swarm.run(1.2)
-    fill(store)
+    pages = store._db.execute("PRAGMA page_count").fetchone()[0]
+    store._db.execute(
+        f"PRAGMA max_page_count = {pages}"
+    )  # the next page that it needs is one too many: a full disk
     cells = np.arange(swarm.terrain.grid.cells)
     author.sync.publish(author.replica.write(cells, LETHAL, 0.0, swarm.now_ns))
     swarm.run(3)

@@ -168,8 +168,7 @@ def test_an_agent_hears_its_own_goals_alone_and_keepers_share_all() -> None:
     send(world, "l", vehicle="a1-00", off=True)
     world.run(1.5)
     assert stores[0].goals() == stores[1].goals()
-    told = heard[-1]
-    assert told.message.shared == []
+    assert heard[-1].message.shared == []
 
 
 @pytest.mark.parametrize(

@@ -9,11 +9,9 @@ from shared_map.keeper.mark_store import KeeperStore
 from shared_map.keeper.service import _NAME_AT_MOST, THROTTLED
 from shared_map.replication.author_limits import _MAX_WAITING, _TURNS, Capacity, Quota
 from shared_map.replication.replica_sync import MapSync
-from swarm.bus.bus import Event, Heard
 from swarm.clock import NS_PER_S
 from swarm.config.scenario import MapConfig, Scenario
 from swarm.wire.messages.map_data import MarkKind, MarkSet
-from swarm.wire.messages.processes import Note
 from swarm.wire.topics import NOTE
 
 _EMPTY = {name: getattr(set_of("a", 0, 1, {}), name) for name in MarkSet.__struct_fields__}
@@ -176,12 +174,7 @@ def test_a_loud_author_is_named_and_late_but_loses_nothing_and_holds_nobody_up()
     keeper = swarm.keeper("keeper", KeeperStore(":memory:"))
     keeper._sync._quota = Quota(20)
     notes: list[str] = []
-
-    def hear(event: Event) -> None:
-        if isinstance(event, Heard) and isinstance(event.message, Note):
-            notes.append(event.message.text)
-
-    swarm.network.bus("ear").subscribe(NOTE, hear)
+    swarm.network.bus("ear").subscribe(NOTE, lambda event: notes.append(event.message.text))
     loud, calm, listener = swarm.writer("loud.1"), swarm.writer("calm.1"), swarm.listener("p")
     swarm.run(1)
     cells = np.arange(40 * 70)

@@ -1,6 +1,5 @@
 """Sync: marks reach every replica once links are back, whatever was lost, and hostile digests cost little."""
 
-
 import numpy as np
 import pytest
 from support.map_strategies import Composite, set_of, sets_asked

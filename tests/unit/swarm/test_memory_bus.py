@@ -12,6 +12,7 @@ from support.trusted_behaviour import *  # noqa: F403
 
 from swarm.bus import memory_bus
 from swarm.bus.bus import AskEnded, Disappeared, Replied, WorkDone
+from swarm.bus.memory_bus import MemoryBus
 from swarm.bus.scheduler import InlineWorker, Scheduler
 from swarm.clock import ManualClock
 from swarm.peers import Peer
@@ -36,20 +37,24 @@ class Links(LossyLinks):
         return self.delays
 
 
+def heard_by_b(links: LossyLinks | None = None) -> tuple[SwarmModel, MemoryBus, MemoryBus, Box]:
+    """Two buses, and what the second hears of poses."""
+    world, box = SwarmModel(links), Box()
+    a, b = world.bus("a"), world.bus("b")
+    b.subscribe(POSE, box)
+    return world, a, b, box
+
+
 def test_a_lost_message_does_not_arrive_and_a_repeated_one_arrives_twice():
     for delays, times in (((), 0), ((1,), 1), ((1, 3), 2)):
-        world, box = SwarmModel(Links(*delays)), Box()
-        a, b = world.bus("a"), world.bus("b")
-        b.subscribe(POSE, box)
+        world, a, _, box = heard_by_b(Links(*delays))
         a.publish(POSE, pose(), target="t0")
         world.settle()
         assert len(box) == times
 
 
 def test_messages_overtake_each_other_where_the_link_says_so():
-    world, box = SwarmModel(), Box()
-    a, b = world.bus("a"), world.bus("b")
-    b.subscribe(POSE, box)
+    world, a, _, box = heard_by_b()
     for seq, delay in ((1, 9), (2, 3), (3, 6)):
         world.network.links = Links(delay)
         a.publish(POSE, pose(seq=seq), target="t0")
@@ -100,9 +105,7 @@ def test_those_who_hear_a_message_share_it():
 
 
 def test_a_closed_node_gets_nothing_that_was_under_way():
-    world, box = SwarmModel(), Box()
-    a, b = world.bus("a"), world.bus("b")
-    b.subscribe(POSE, box)
+    world, a, b, box = heard_by_b()
     b.watch_alive(box)
     a.declare_alive(Peer("agent", "a", 1))
     a.publish(POSE, pose(), target="t0")
@@ -127,9 +130,7 @@ def test_a_node_that_dies_while_cut_off_stays_gone():
 
 
 def test_every_delivery_is_traced():
-    world = SwarmModel()
-    a, b = world.bus("a"), world.bus("b")
-    b.subscribe(POSE, Box())
+    world, a, _, _ = heard_by_b()
     a.publish(POSE, pose(), target="t0")
     world.settle()
     ((now_ns, source, destination, what, payload),) = world.deliveries

@@ -68,8 +68,12 @@ class Keeper:
         return None
 
 
-def test_what_is_ordered_last_counts_even_after_the_clock_was_set_back() -> None:
-    keeper = Keeper()
+@pytest.fixture
+def keeper() -> Keeper:
+    return Keeper()
+
+
+def test_what_is_ordered_last_counts_even_after_the_clock_was_set_back(keeper: Keeper) -> None:
     keeper.give(subject="pause")
     assert keeper.book.paused
     assert keeper.book.stopped("a0-00")
@@ -78,8 +82,7 @@ def test_what_is_ordered_last_counts_even_after_the_clock_was_set_back() -> None
     assert not keeper.book.paused
 
 
-def test_targets_come_move_and_go() -> None:
-    keeper = Keeper()
+def test_targets_come_move_and_go(keeper: Keeper) -> None:
     assert keeper.give(subject="target", name="x", cell=5, walk="still", new=True) is None
     assert list(keeper.book.targets(SCENARIO)) == ["t0", "t1", "real", "x"]
     assert keeper.book.targets_of("blue", SCENARIO) == ["t0", "t1", "real", "x"]
@@ -103,8 +106,7 @@ def test_targets_come_move_and_go() -> None:
     assert keeper.book.targets_of("red", SCENARIO) == ["t0"]
 
 
-def test_a_setting_is_the_scenarios_again_once_it_is_taken_back() -> None:
-    keeper = Keeper()
+def test_a_setting_is_the_scenarios_again_once_it_is_taken_back(keeper: Keeper) -> None:
     keeper.give(subject="set", name="time_scale", value=7.0)
     assert keeper.book.setting("time_scale", 1.0) == 7.0
     keeper.give(subject="set", name="time_scale", off=True)
@@ -138,9 +140,8 @@ def test_every_setting_that_may_change_is_one_of_the_scenario_and_within_its_bou
         ({"subject": "set", "name": "time_scale"}, "None is not in"),
     ],
 )
-def test_what_cannot_be_ordered_is_refused_in_a_sentence(fields: dict[str, Any], says: str) -> None:
-    refusal = Keeper().give(**fields)
-    assert says in refusal
+def test_what_cannot_be_ordered_is_refused_in_a_sentence(fields: dict[str, Any], says: str, keeper: Keeper) -> None:
+    assert says in keeper.give(**fields)
 
 
 @pytest.mark.parametrize(
@@ -158,8 +159,7 @@ def test_an_order_that_says_too_little_is_no_message(fields: dict[str, Any], say
         GiveOrder(**fields)
 
 
-def test_the_last_target_stays() -> None:
-    keeper = Keeper()
+def test_the_last_target_stays(keeper: Keeper) -> None:
     for name in ("t0", "real"):
         assert keeper.give(subject="target", name=name, off=True) is None
     refusal = keeper.give(subject="target", name="t1", off=True)

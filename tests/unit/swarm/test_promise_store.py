@@ -30,7 +30,7 @@ def table(shard: int, seq: int) -> Table:
 
 
 def saved_in(path: Path) -> tuple[OwnRecord, dict[int, tuple[int, Table]]]:
-    """The record that the next generation finds."""
+    """The content of the file, as the next generation finds it."""
     store = FilePromiseStore(path)
     store.close()
     return store.own, store.saved

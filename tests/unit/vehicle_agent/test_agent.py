@@ -10,7 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from support.makers import route_reply
-from support.shard_tables import grants_of, holdings_of
+from support.shard_tables import granted_cells, holdings_of
 
 from shared_map.terrain.terrain import terrain_of_pace
 from shared_map.vehicle_class_grounds import class_grounds
@@ -20,7 +20,6 @@ from swarm.config.scenario import Scenario
 from swarm.grid import GridSpec
 from swarm.right_of_way.shards import Shards
 from swarm.wire.fields import column
-from swarm.wire.messages.traffic import Granted
 from swarm.wire.route_columns import RouteBatch
 from vehicle_agent.agent import Agent, AskRoutes
 from vehicle_agent.agent_maps import LocalMap
@@ -51,8 +50,8 @@ def agent_of(scenario: Scenario, index: int = 0) -> Agent:
 def grant(agent: Agent, seq: int, **cells: list[int]) -> None:
     """The leader of a shard grants cells to a0-00 and a0-01, named by their last digit."""
     leader = Shards(GRID, ["a0", "a1"]).leader(0, 1)
-    grants = grants_of(agent.holdings, seq, {f"a0-0{name[1:]}": each for name, each in cells.items()})
-    granted = Granted(shard=0, host="a0", agent=leader, epoch=1, seq=seq, generation=1, heard=seq, grants=grants)
+    named = {f"a0-0{name[1:]}": each for name, each in cells.items()}
+    granted = granted_cells(agent.holdings, leader, seq, named)
     agent.place(agent.holdings.hear_granted(granted, seq))
 
 

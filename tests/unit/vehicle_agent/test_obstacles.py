@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
+from msgspec.structs import replace
 
 from shared_map.terrain.step_climb import climb_of
 from swarm.clock import NS_PER_S
@@ -176,23 +177,16 @@ def steering(obstacles: Obstacles, pace: np.ndarray) -> Steering:
 def standing(obstacles: Obstacles, report: Obstacle) -> None:
     obstacles.take_report(report, NOW)
     obstacles.tick(NOW + NS_PER_S - 1)
-    obstacles.take_report(
-        Obstacle(**{f: getattr(report, f) for f in report.__struct_fields__} | {"seq": 2}), NOW + NS_PER_S - 1
-    )
+    obstacles.take_report(replace(report, seq=2), NOW + NS_PER_S - 1)
     obstacles.tick(NOW + NS_PER_S)
-
-
-def vehicle_on(route: list[int]) -> Vehicle:
-    vehicle = Vehicle("a0-00", GRID, route[0])
-    vehicle.assign("t", 0)
-    given = GivenRoute("t", tuple(route), 1.0, 1.0, partial=False)
-    assert vehicle.give_route(given, [route[0]], 0) is not None
-    return vehicle
 
 
 def drive_around(obstacles, pace, ticks=60, climb=None):
     route = [GRID.cell(20, col) for col in range(5, 35)]
-    vehicle = vehicle_on(route)
+    vehicle = Vehicle("a0-00", GRID, route[0])
+    vehicle.assign("t", 0)
+    given = GivenRoute("t", tuple(route), 1.0, 1.0, partial=False)
+    assert vehicle.give_route(given, [route[0]], 0) is not None
     detours = Detours(GRID, pace, steering(obstacles, pace).steps, obstacles, climb)
     for tick in range(ticks):
         detours.tick([vehicle], lambda id: [route[0]], NOW + NS_PER_S + tick * TICK)

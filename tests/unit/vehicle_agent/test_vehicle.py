@@ -31,11 +31,16 @@ def vehicle() -> Vehicle:
 
 
 @pytest.fixture
-def follower(vehicle: Vehicle) -> Vehicle:
+def waiting(vehicle: Vehicle) -> Vehicle:
     vehicle.assign("t0", S)
     vehicle.route_request(S)
-    vehicle.give_route(ROUTE, [vehicle.cell], S)
     return vehicle
+
+
+@pytest.fixture
+def follower(waiting: Vehicle) -> Vehicle:
+    waiting.give_route(ROUTE, [waiting.cell], S)
+    return waiting
 
 
 def run_out(vehicle: Vehicle) -> None:
@@ -80,11 +85,9 @@ def test_with_its_target_in_reach_it_has_arrived_and_asks_nothing(follower: Vehi
     assert follower.route_request(4 * S) is Reason.RAN_OUT
 
 
-def test_a_route_given_in_parts_is_asked_for_before_it_ends(vehicle: Vehicle) -> None:
-    vehicle.assign("t0", S)
-    vehicle.route_request(S)
-    vehicle.give_route(GivenRoute("t0", (11, 12, 13), 9.0, 9.0, partial=True), [vehicle.cell], S)
-    assert vehicle.route_request(2 * S) is Reason.CONTINUED
+def test_a_route_given_in_parts_is_asked_for_before_it_ends(waiting: Vehicle) -> None:
+    waiting.give_route(GivenRoute("t0", (11, 12, 13), 9.0, 9.0, partial=True), [waiting.cell], S)
+    assert waiting.route_request(2 * S) is Reason.CONTINUED
     assert not Reason.CONTINUED.is_reroute
 
 
@@ -126,16 +129,14 @@ def test_its_planner_gone_it_keeps_its_route_and_is_lost_until_the_planner_is_ba
     assert follower.route_request(4 * S) is Reason.PLANNER_BACK
 
 
-def test_no_way_to_its_target_leaves_it_stranded_and_it_tries_again(vehicle: Vehicle) -> None:
-    vehicle.assign("t0", S)
-    vehicle.route_request(S)
-    vehicle.refuse_route("t0", RouteStatus.UNREACHABLE, S)
-    assert vehicle.state is VehicleState.STRANDED
-    assert vehicle.route_request(2 * S) is None
-    assert vehicle.route_request(5 * S) is not None
-    assert vehicle.state is VehicleState.STRANDED
-    vehicle.give_route(ROUTE, [vehicle.cell], 5 * S)
-    assert vehicle.state is VehicleState.FOLLOWING
+def test_no_way_to_its_target_leaves_it_stranded_and_it_tries_again(waiting: Vehicle) -> None:
+    waiting.refuse_route("t0", RouteStatus.UNREACHABLE, S)
+    assert waiting.state is VehicleState.STRANDED
+    assert waiting.route_request(2 * S) is None
+    assert waiting.route_request(5 * S) is not None
+    assert waiting.state is VehicleState.STRANDED
+    waiting.give_route(ROUTE, [waiting.cell], 5 * S)
+    assert waiting.state is VehicleState.FOLLOWING
 
 
 def test_one_that_stands_on_its_route_while_no_way_leads_on_is_stranded(follower: Vehicle) -> None:
@@ -145,12 +146,10 @@ def test_one_that_stands_on_its_route_while_no_way_leads_on_is_stranded(follower
         assert follower.state is state
 
 
-def test_a_planner_that_has_not_seen_the_target_yet_is_asked_again(vehicle: Vehicle) -> None:
-    vehicle.assign("t0", S)
-    vehicle.route_request(S)
-    vehicle.refuse_route("t0", RouteStatus.NO_TARGET, S)
-    assert vehicle.state is VehicleState.WAITING
-    assert vehicle.route_request(2 * S) is not None
+def test_a_planner_that_has_not_seen_the_target_yet_is_asked_again(waiting: Vehicle) -> None:
+    waiting.refuse_route("t0", RouteStatus.NO_TARGET, S)
+    assert waiting.state is VehicleState.WAITING
+    assert waiting.route_request(2 * S) is not None
 
 
 @pytest.mark.parametrize(
