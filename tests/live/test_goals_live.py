@@ -8,7 +8,6 @@ import signal
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import pytest
 from support.live_swarm import SMALL_TERRAIN, LiveSwarm, running
@@ -45,13 +44,6 @@ def fleet(tmp_path: Path) -> Iterator[LiveSwarm]:
         yield fleet
 
 
-def status(live: LiveSwarm) -> dict[str, Any]:
-    """The output of `swarm status`; empty while no process answers."""
-    done = command("status", "--connect", live.endpoint, "--json")
-    found: dict[str, Any] = json.loads(done.stdout) if done.returncode == 0 else {}
-    return found
-
-
 def test_ten_vehicles_get_to_ten_places_though_their_agent_and_the_planner_of_places_are_killed(
     fleet: LiveSwarm,
 ) -> None:
@@ -85,9 +77,7 @@ def test_ten_vehicles_get_to_ten_places_though_their_agent_and_the_planner_of_pl
         rover.leave()
         # Each goes to where another one has been, so that there is a way.
         goals = {id: began[ids[(n + 7) % 10]] for n, id in enumerate(ids)}
-        done = command(
-            "order", "vehicle", "send", ids[0], cell(goals[ids[0]]), "--connect", fleet.endpoint,
-        )  # fmt: skip
+        done = command("order", "vehicle", "send", ids[0], cell(goals[ids[0]]), "--connect", fleet.endpoint)
         assert done.returncode == 0, done.stderr
         assert "obeyed by 1 process," in done.stdout
         for id in ids[1:]:
@@ -98,7 +88,8 @@ def test_ten_vehicles_get_to_ten_places_though_their_agent_and_the_planner_of_pl
         assert orders.resume().silent == []
 
         def all_there() -> bool:
-            goals_now = status(fleet).get("goals", [])
+            told = command("status", "--connect", fleet.endpoint, "--json")
+            goals_now = json.loads(told.stdout)["goals"] if told.returncode == 0 else []  # while no process answers
             return len(goals_now) == 10 and all(each["state"] == "completed" for each in goals_now)
 
         eventually(all_there, 120, "all vehicles at their places")

@@ -192,16 +192,13 @@ def test_a_hostile_request_is_refused_and_the_next_probe_is_answered(
 
 
 def test_one_who_holds_all_connections_open_keeps_no_probe_out(server: Server) -> None:
-    held = [socket.create_connection(place(server), 10) for _ in range(2 * MOST_CONNECTIONS)]
-    try:
-        for each in held:
+    with contextlib.ExitStack() as held:
+        for _ in range(2 * MOST_CONNECTIONS):
+            each = held.enter_context(socket.create_connection(place(server), 10))
             with contextlib.suppress(OSError):  # it may have been cut already
                 each.sendall(b"GET /healthz HTT")
         for _ in range(5):
             assert ask(server.url, live=True).ok
-    finally:
-        for each in held:
-            each.close()
 
 
 def is_cut(connection: socket.socket) -> bool:

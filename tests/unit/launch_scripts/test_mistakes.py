@@ -54,10 +54,6 @@ def port_taken(folder: Path, request: pytest.FixtureRequest) -> None:
     path.write_text(f'{TINY}[network]\nlisten = ["{endpoint}"]\nconnect = ["{endpoint}"]\n')
 
 
-def one_machine(folder: Path, request: pytest.FixtureRequest) -> None:
-    (folder / "hosts.toml").write_text('survive = 1\n[[hosts]]\nname = "a"\naddress = "10.0.0.1"\n')
-
-
 def two_machines(folder: Path, request: pytest.FixtureRequest) -> None:
     rows = (f'[[hosts]]\nname = "m{n}"\naddress = "10.0.0.{n}"\n' for n in (1, 2))
     (folder / "hosts.toml").write_text("".join(rows))

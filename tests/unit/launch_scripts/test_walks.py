@@ -31,7 +31,7 @@ from shared_map.terrain.step_climb import climb_of
 from swarm.clock import NS_PER_S
 from swarm.config.ground import CostConfig
 from swarm.config.load import parse_scenario
-from swarm.config.scenario import Scenario, TargetConfig
+from swarm.config.scenario import TargetConfig
 from swarm.config.setting_types import Walk
 from swarm.errors import ConfigError, TerrainError
 from swarm.grid import GridSpec
@@ -212,9 +212,7 @@ def ground() -> TrueTerrain:
     return TrueTerrain(GRID, pace)
 
 
-@pytest.fixture
-def scenario() -> Scenario:
-    return parse_scenario(TEXT)
+SCENARIO = parse_scenario(TEXT)
 
 
 def driven(rovers: Rovers, seconds: float, time_scale: float = 2.0) -> list[dict[str, Obstacle]]:
@@ -227,8 +225,8 @@ def driven(rovers: Rovers, seconds: float, time_scale: float = 2.0) -> list[dict
     return ticks
 
 
-def test_a_rover_is_always_where_its_last_word_said_that_it_would_be(scenario: Scenario) -> None:
-    ticks = driven(Rovers(scenario, ground(), 1), 60.0)
+def test_a_rover_is_always_where_its_last_word_said_that_it_would_be() -> None:
+    ticks = driven(Rovers(SCENARIO, ground(), 1), 60.0)
     moved = 0
     for before, after in itertools.pairwise(ticks):
         for id, obstacle in after.items():
@@ -242,9 +240,9 @@ def test_a_rover_is_always_where_its_last_word_said_that_it_would_be(scenario: S
     assert moved > 1000
 
 
-def test_rovers_keep_to_the_ground_and_stop_at_times(scenario: Scenario) -> None:
+def test_rovers_keep_to_the_ground_and_stop_at_times() -> None:
     terrain = ground()
-    ticks = driven(Rovers(scenario, terrain, 1), 60.0)
+    ticks = driven(Rovers(SCENARIO, terrain, 1), 60.0)
     obstacles = [obstacle for told in ticks for obstacle in told.values()]
     assert not any(
         terrain.lethal(int(-obstacle.y_m // 10) * 30 + int(obstacle.x_m // 10)) for obstacle in obstacles
@@ -252,9 +250,9 @@ def test_rovers_keep_to_the_ground_and_stop_at_times(scenario: Scenario) -> None
     assert {obstacle.speed_m_per_s for obstacle in obstacles} == {0.0, 6.0}
 
 
-def test_one_that_takes_over_goes_on_from_where_the_other_was(scenario: Scenario) -> None:
-    ticks = driven(Rovers(scenario, ground(), 1), 20.0)
-    second = Rovers(scenario, ground(), 2)
+def test_one_that_takes_over_goes_on_from_where_the_other_was() -> None:
+    ticks = driven(Rovers(SCENARIO, ground(), 1), 20.0)
+    second = Rovers(SCENARIO, ground(), 2)
     for obstacle in ticks[-1].values():
         second.note_obstacle(obstacle)
     second.note_obstacle(msgspec.structs.replace(ticks[-1]["r0"], id="nobody"))
@@ -264,14 +262,14 @@ def test_one_that_takes_over_goes_on_from_where_the_other_was(scenario: Scenario
         assert (obstacle.incarnation, obstacle.seq) == (2, 1)
 
 
-def test_rovers_stand_while_the_run_is_paused(scenario: Scenario) -> None:
-    ticks = driven(Rovers(scenario, ground(), 1), 3.0, time_scale=0.0)
+def test_rovers_stand_while_the_run_is_paused() -> None:
+    ticks = driven(Rovers(SCENARIO, ground(), 1), 3.0, time_scale=0.0)
     assert {(obstacle.x_m, obstacle.y_m, obstacle.speed_m_per_s) for obstacle in ticks[-1].values()} == {
         (obstacle.x_m, obstacle.y_m, 0.0) for obstacle in ticks[0].values()
     }
 
 
-def test_rovers_need_the_process_that_moves_them_and_names_of_their_own(scenario: Scenario) -> None:
+def test_rovers_need_the_process_that_moves_them_and_names_of_their_own() -> None:
     external = parse_scenario(TEXT + '[[targets]]\nwalk = "external"\n')
     assert any(spec.role == "targets" for spec in processes_of(external))
     with pytest.raises(ConfigError, match="two rovers are called 'r0'"):
