@@ -169,10 +169,8 @@ def test_an_answer_may_carry_many_values_where_the_topic_says_so(world: World):
 
 
 def test_an_ended_subscription_hears_nothing_more_and_the_others_go_on(world: World):
-    a, b = world.bus("a"), world.bus("b")
-    one, every = Box(), Box()
+    (a, b, every), one = heard_by(world, TRUE_POSE), Box()
     b.subscribe(TRUE_POSE, one, target="t0")
-    b.subscribe(TRUE_POSE, every)
     world.settle()
     a.publish(TRUE_POSE, pose("t0", seq=1), target="t0")
     world.until(lambda: one and every)
@@ -189,10 +187,8 @@ def test_an_ended_subscription_hears_nothing_more_and_the_others_go_on(world: Wo
 
 
 def test_a_subscription_with_a_field_hears_only_that_key(world: World):
-    a, b = world.bus("a"), world.bus("b")
-    one, every = Box(), Box()
+    (a, b, every), one = heard_by(world, TRUE_POSE), Box()
     b.subscribe(TRUE_POSE, one, target="t1")
-    b.subscribe(TRUE_POSE, every)
     world.settle()
     for target in ("t0", "t1", "t10"):
         a.publish(TRUE_POSE, pose(target), target=target)

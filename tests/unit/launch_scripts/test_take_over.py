@@ -130,8 +130,12 @@ def test_nobody_is_asked_before_successors_are_ready_and_each_file_has_one_write
                     assert machine.predecessors[each.spec.name] not in machine.alive
 
 
-def test_all_are_followed_in_the_end(monkeypatch: pytest.MonkeyPatch) -> None:
-    machine = Machine(monkeypatch)
+@pytest.fixture
+def machine(monkeypatch: pytest.MonkeyPatch) -> Machine:
+    return Machine(monkeypatch)
+
+
+def test_all_are_followed_in_the_end(machine: Machine) -> None:
     assert [each.spec.name for each in machine.running if each.alive] == ["planner-t0", "planner-t1.r1"]
     for what in ("t0 answers", "t1 answers", "agent waits", *["one ends"] * 5):
         assert not machine.over.done
@@ -142,17 +146,13 @@ def test_all_are_followed_in_the_end(monkeypatch: pytest.MonkeyPatch) -> None:
     assert machine.said == ["successors are ready: the launcher before is asked to end"]
 
 
-def test_a_planner_that_never_has_a_tree_holds_nothing_up_for_ever(monkeypatch: pytest.MonkeyPatch) -> None:
-    machine = Machine(monkeypatch)
+def test_a_planner_that_never_has_a_tree_holds_nothing_up_for_ever(machine: Machine) -> None:
     for _ in range(8):
         machine.happens("ten seconds pass")
     assert machine.asked == [(LAUNCHER, signal.SIGTERM)]
 
 
-def test_who_crashed_is_begun_once_the_launcher_before_starts_it_no_more(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    machine = Machine(monkeypatch)
+def test_who_crashed_is_begun_once_the_launcher_before_starts_it_no_more(machine: Machine) -> None:
     for what in ("keeper crashes", "t0 answers", "t1 answers", "agent waits"):
         machine.happens(what)
         assert not machine.one("keeper-0").alive
@@ -164,8 +164,7 @@ def test_who_crashed_is_begun_once_the_launcher_before_starts_it_no_more(
     assert machine.one("keeper-0").alive
 
 
-def test_an_agent_whose_generation_before_crashed_is_waited_for_no_longer(monkeypatch: pytest.MonkeyPatch) -> None:
-    machine = Machine(monkeypatch)
+def test_an_agent_whose_generation_before_crashed_is_waited_for_no_longer(machine: Machine) -> None:
     for what in ("t0 answers", "t1 answers"):
         machine.happens(what)
     machine.says("agent-a0", lambda health: health.turned([]))
@@ -173,10 +172,7 @@ def test_an_agent_whose_generation_before_crashed_is_waited_for_no_longer(monkey
     assert machine.asked == [(LAUNCHER, signal.SIGTERM)]
 
 
-def test_a_launcher_that_was_killed_is_followed_and_nobody_is_signalled(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    machine = Machine(monkeypatch)
+def test_a_launcher_that_was_killed_is_followed_and_nobody_is_signalled(machine: Machine) -> None:
     machine.alive = {PREDECESSORS["router-0"]}  # it has not noticed yet
     machine.turn()
     assert machine.asked == []

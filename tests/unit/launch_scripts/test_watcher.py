@@ -28,13 +28,15 @@ from swarm.wire.messages.vehicles import Fleet, Followed
 from swarm.wire.topics import FLEET, FOLLOWED, NOTE, ORDERS, POSE, STATS, STATUS
 
 
-def begun(swarm: SwarmModel) -> tuple[Watcher, list[object]]:
+def begun() -> tuple[SwarmModel, Watcher, list[object]]:
+    """A swarm, the watcher of its launcher, and what that records."""
+    swarm = SwarmModel()
     recorder = Recorder(swarm.scenario, swarm.terrain.grid)
     heard: list[object] = []
     record = recorder.heard
     recorder.heard = lambda message, *rest: (heard.append(message), record(message, *rest))[1]  # type: ignore[method-assign]
     watcher = Watcher(swarm.bus("launcher"), recorder, swarm.scheduler.clock)
-    return watcher, heard
+    return swarm, watcher, heard
 
 
 def drive(swarm: SwarmModel, watcher: Watcher, ticks: int, every_s: float) -> None:
@@ -52,8 +54,7 @@ def followed() -> Followed:
 
 
 def test_positions_are_taken_oftener_than_they_are_sampled_and_the_last_is_the_newest() -> None:
-    swarm = SwarmModel()
-    watcher, heard = begun(swarm)
+    swarm, watcher, heard = begun()
     drive(swarm, watcher, 40, 0.1)
     swarm.run(0.5)
     watcher.listen(0.0)
@@ -63,8 +64,7 @@ def test_positions_are_taken_oftener_than_they_are_sampled_and_the_last_is_the_n
 
 
 def test_the_first_route_that_is_begun_says_that_routes_are_served_and_the_others_are_not_heard() -> None:
-    swarm = SwarmModel()
-    watcher, heard = begun(swarm)
+    swarm, watcher, heard = begun()
     agent = swarm.bus("agent")
     for _ in range(3):
         agent.publish(FOLLOWED, followed(), agent="a0", vehicle="a0-00")
@@ -75,8 +75,7 @@ def test_the_first_route_that_is_begun_says_that_routes_are_served_and_the_other
 
 
 def test_what_is_said_last_is_recorded_also_if_it_was_not_due_yet() -> None:
-    swarm = SwarmModel()
-    watcher, heard = begun(swarm)
+    swarm, watcher, heard = begun()
     drive(swarm, watcher, 3, 0.05)
     assert [message.seq for message in heard if isinstance(message, Fleet)] == [0]
     watcher.finish()
@@ -84,8 +83,7 @@ def test_what_is_said_last_is_recorded_also_if_it_was_not_due_yet() -> None:
 
 
 def test_where_the_live_view_is_is_learned_from_the_figures_of_the_monitor_alone() -> None:
-    swarm = SwarmModel()
-    watcher, _ = begun(swarm)
+    swarm, watcher, _ = begun()
     bus = swarm.bus("monitor")
     for role, port in (("agent", 8080), ("monitor", 0), ("monitor", 9090)):
         bus.publish(STATS, stats(role, "0", web_port=port, gauges={VIEWERS: port}), role=role, id="0")
@@ -97,7 +95,7 @@ def test_where_the_live_view_is_is_learned_from_the_figures_of_the_monitor_alone
 
 
 def test_processes_of_others_are_not_gone_because_the_launcher_ends_its_own_and_their_router() -> None:
-    watcher, _ = begun(SwarmModel())
+    _, watcher, _ = begun()
     watcher.end([ProcessSpec("agent", "a0")])
     for event in (Appeared, Disappeared):
         for id in ("a0", "a1"):
