@@ -221,6 +221,10 @@ class Lied(SwarmModel):
             store.close()
 
 
+def ignore(event: Event) -> None:
+    pass
+
+
 @cache
 def world(run: str) -> tuple[Scenario, Terrain, Floats]:
     """Scenario, terrain and truth."""
