@@ -213,7 +213,7 @@ class MessageFuzzer:
             )
             for _ in range(choice((1, 3, 40)))
         }
-        columns = columns_of(said, self._stamp_ns(0, (1 << 62) - 1))
+        columns: Sequence[np.ndarray] = columns_of(said, self._stamp_ns(0, (1 << 62) - 1))
         names = ("cells", "kinds", "paces", "stamps_ns")
         return {name: each.tobytes() for name, each in zip(names, columns, strict=True)}
 
