@@ -98,14 +98,12 @@ class _Generation:
     """Inputs and actions of one generation of an agent.
 
     cells      vehicle -> where it is. It stays there when the process dies, until the next generation. The cell in
-               which a generation finds a vehicle first is no step
-    replaced   a younger generation drives them
+               which a generation finds a vehicle first is no step. Empty once a younger generation drives them
     reports    (obstacle, incarnation) -> the newest report that was delivered to it, and when
     ticked_ns  its last tick; None before the first
     """
 
     cells: dict[str, int] = field(default_factory=dict)
-    replaced: bool = False
     reports: dict[tuple[str, int], tuple[Obstacle, int]] = field(default_factory=dict)
     ticked_ns: int | None = None
 
@@ -209,7 +207,8 @@ class LawBook:
             to_go = vehicle.state in _UNDER_WAY and not (agent.stopped(id) or id in agent.shut_in)
             counts_s = 0.0 if disturbed else (now_ns - ticked_ns) / NS_PER_S
             self._wait(vehicle, to_go, counts_s, self._across_m * truth.item(vehicle.cell))
-        generation.replaced = agent.holdings.replaced
+        if agent.holdings.replaced:  # its successor drives them; it may begin again later, and then holds nothing
+            cells.clear()
         self._collide()
 
     def _routed(self, ground: TrueTerrain, vehicle: Vehicle) -> bool:
@@ -239,7 +238,7 @@ class LawBook:
 
     def _collide(self) -> None:
         now_s = self.simulation.now_s
-        driven = [each.cells for each in self._generations.values() if not each.replaced]
+        driven = [each.cells for each in self._generations.values()]
         on: dict[tuple[int, bool], str] = {}
         for cells in (self._unmoved, *driven):
             for id, cell in cells.items():
