@@ -576,6 +576,11 @@ class Agent:
 
     # --- which target ---------------------------------------------------------------------------------------
 
+    def costs_given(self, request: int, target: str, costs_s: NDArray[np.float32]) -> bool:
+        """A planner's answer to `AskCosts`. Returns True if every living planner has answered."""
+        self.assignment.costs_given(request, target, costs_s)
+        return self.assignment.all_given(self._planners)
+
     def costs_ended(self, request: int, now_ns: int) -> SharedCosts | None:
         """No more answers to `AskCosts` will come; returns what to tell the other agents of the group."""
         standing = list(filter(self.stopped, self.vehicles))

@@ -168,7 +168,7 @@ class AgentService(MemberService):
                 self._on_routes(event, reply, now_ns)
             case Replied(tag=tag, message=planning.CostReply() as reply, took_s=took_s):
                 self._answer_s = max(_ANSWER_S, _TRIPS * took_s)
-                self._on_costs(_number(tag), reply)
+                self._on_costs(_number(tag), reply, now_ns)
             case AskEnded(tag=tag, failure=failure) if tag.startswith(_ROUTES):
                 self._wait_longer(failure)
                 self.agent.routes_ended(_number(tag), now_ns)
@@ -453,10 +453,12 @@ class AgentService(MemberService):
         self.counters.count("routes_received", len(reply.routes))
         self._publish_followed(self.agent.routes_given(_number(replied.tag), reply, now_ns))
 
-    def _on_costs(self, request: int, reply: planning.CostReply) -> None:
+    def _on_costs(self, request: int, reply: planning.CostReply, now_ns: int) -> None:
         costs_s = column(reply.cost_to_go_s, "<f4")
-        if reply.target_cell is not None or np.isfinite(costs_s).any():  # never seen, and searched for
-            self.agent.assignment.costs_given(request, reply.target, costs_s)
+        # A target that was never seen has costs while it is searched for.
+        known = reply.target_cell is not None or bool(np.isfinite(costs_s).any())
+        if known and self.agent.costs_given(request, reply.target, costs_s):
+            self._on_costs_ended(request, now_ns)
 
     def _on_costs_ended(self, request: int, now_ns: int) -> None:
         costs = self.agent.costs_ended(request, now_ns)

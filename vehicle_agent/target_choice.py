@@ -221,6 +221,11 @@ class Assignment:
         if asked is not None and asked.request == request and len(costs_s) == len(asked.cells):
             self._costs_s[target] = costs_s
 
+    def all_given(self, planners: Collection[str]) -> bool:
+        """True if these planners, which live, have all answered the open request. Its end may be seconds later,
+        where a message was lost."""
+        return self._open is not None and have_answered(self._costs_s, self.targets, planners)
+
     def costs_ended(
         self,
         request: int,

@@ -100,6 +100,19 @@ def test_a_vehicle_that_finds_its_place_after_the_others_is_assigned_soon() -> N
     assert min(tenth for tenth, vehicles in asks if "a0-01" in vehicles) <= 20
 
 
+def test_once_all_living_planners_have_answered_the_end_of_a_question_is_not_waited_for(agent: Agent) -> None:
+    (asked,) = agent.decide(0)
+    costs_s = np.array([5.0, 6.0], np.float32)
+    assert not agent.costs_given(asked.request, "t0", costs_s)
+    assert not agent.costs_given(asked.request, "t1", costs_s[:1])
+    assert agent.costs_given(asked.request, "t1", costs_s)
+    agent.costs_ended(asked.request, 0)
+    assert not agent.costs_given(asked.request, "t1", costs_s)
+    agent.set_planners({"t0": 1}, S)
+    (asked, *_) = [each for each in agent.decide(10 * S) if isinstance(each, AskCosts)]
+    assert agent.costs_given(asked.request, "t0", costs_s)
+
+
 def test_nobody_answering_is_asked_again_soon(agent: Agent) -> None:
     (asked,) = agent.decide(0)
     agent.costs_ended(asked.request, S)
