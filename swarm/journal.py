@@ -85,7 +85,11 @@ class Lock:
         make_folder(path.parent)
         with writing(path):
             self._file = os.open(f"{path}.lock", os.O_CREAT | os.O_RDWR, 0o600)
-        _lock(path, self._file, in_use, waits=waits)
+        try:
+            _lock(path, self._file, in_use, waits=waits)
+        except StoreError:
+            self.close()
+            raise
 
     def witness(self, seal: Seal) -> None:
         with writing(self._path):

@@ -71,7 +71,7 @@ class Description(msgspec.Struct, frozen=True, kw_only=True):
     key       `scenario_key` of what they were made from
     steepest  of its climb; None where steps cost the same both ways
     arrays    name of each file beside it -> sum of its values
-    sum       of all the rest, by which damage is noticed; None in those of older builds, which had none
+    sum       of all the rest, by which damage is noticed
     """
 
     format: int
@@ -92,7 +92,11 @@ class Description(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class _Stamp(msgspec.Struct, frozen=True):
-    """The part of every description, older ones too, that says whether the rest is of use."""
+    """The part of every description, older ones too, that says whether the rest is of use.
+
+    sum  None in those of builds which wrote none. `FORMAT` does not tell, as it counts in the digest of a terrain,
+         which neighbouring builds in one run share
+    """
 
     format: int = 0
     key: str = ""
@@ -249,7 +253,7 @@ def read_array(folder: Path, name: str, meta: Description, shape: Iterable[int],
     except (OSError, ValueError, EOFError, SyntaxError, RecursionError, MemoryError) as error:
         raise TerrainError(f"prepared terrain {path} is unreadable ({error}); delete the folder") from error
     if array.shape != tuple(shape) or array.dtype != dtype or _sum(array) != meta.arrays.get(name):
-        raise TerrainError(f"prepared terrain {path} is damaged: expected the values of {_META}; delete the folder")
+        raise TerrainError(f"prepared terrain {path} is damaged: expected the values described; delete the folder")
     return array
 
 

@@ -10,6 +10,7 @@ import time
 from pathlib import Path
 from random import Random
 
+import psutil
 import pytest
 from support.effort import few
 from support.simulated import agents
@@ -250,3 +251,12 @@ def test_members_are_told_of_an_agent_whose_certificate_is_revoked_and_of_its_ne
         simulation.run_until(4.0 * (looks + 1))
         assert told == ["a0"] * looks * len(agents(simulation))
         names.append(new)
+
+
+def test_a_refused_store_leaves_no_file_open(tmp_path: Path) -> None:
+    store = FilePromiseStore(tmp_path / "promises-a0")
+    before = psutil.Process().num_fds()
+    with pytest.raises(StoreError, match="in use"):
+        FilePromiseStore(tmp_path / "promises-a0")
+    assert psutil.Process().num_fds() == before
+    store.close()
