@@ -56,8 +56,8 @@ Duties of a member:
 
 No clock decides anything but when to claim.
 
-Messages (`swarm.wire.messages.traffic`), of which all but `Left` and a `Table` of changes carry the whole state of
-their key:
+Messages (`swarm.wire.messages.traffic`), of which all but `Left` carry the whole state of their key, or its changes
+since a state that the receiver has:
 
 `HostState`     Host to leader: all vehicles of the host that hold or want a cell of one shard, each with its
                 next cells (`Stand`, made of a `Wish`). `knows` is the newest table that the host acts on: of

@@ -6,7 +6,7 @@ word of their own host, or by proof that its generation has ended.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
 from functools import lru_cache
 
 from swarm.config.agent_plan import agent_of
@@ -99,9 +99,14 @@ class Orders:
         """The number of entries of a host."""
         return sum(len(self.of[vehicle]) for vehicle in self.by_host.get(host, ()))
 
-    def cells_of(self, host: str) -> set[int]:
-        """The cells of which vehicles of a host have an entry, by its newest generation."""
-        return {number[0] for vehicle in self.by_host.get(host, ()) for number in self.of[vehicle]}
+    def occupied(self, cells: Set[int], host: str) -> list[int]:
+        """Those of these cells of which there are entries, and none of a host's newest generation."""
+        mine, fences = self.by_host.get(host, {}), self._fences
+        return [
+            cell
+            for cell in sorted(cells & self.orders.keys())
+            if not any(vehicle in mine and number not in fences for number, vehicle in self.orders[cell].items())
+        ]
 
     def is_fenced(self, cell: int) -> bool:
         """Returns True if an earlier generation of a host may be on a cell, or enter it."""
@@ -170,12 +175,11 @@ class Orders:
     def followed(self) -> dict[str, dict[str, list[Number]]]:
         """Returns host -> host -> entries of the first behind which vehicles of the second wait."""
         found: dict[str, dict[str, list[Number]]] = {}
-        for order in self.orders.values():
-            if len(order) > 1:
-                hosts = [(number, agent_of(vehicle)) for number, vehicle in order.items()]
-                for index, (number, host) in enumerate(hosts):
-                    for other in dict.fromkeys(other for _, other in hosts[index + 1 :]):
-                        found.setdefault(host, {}).setdefault(other, []).append(number)
+        for order in [each for each in self.orders.values() if len(each) > 1]:
+            hosts = [(number, agent_of(vehicle)) for number, vehicle in order.items()]
+            for index, (number, host) in enumerate(hosts):
+                for other in dict.fromkeys(other for _, other in hosts[index + 1 :]):
+                    found.setdefault(host, {}).setdefault(other, []).append(number)
         return found
 
     # --- what hosts say -------------------------------------------------------------------------------------

@@ -5,11 +5,15 @@ from __future__ import annotations
 import struct
 from collections.abc import Sequence
 from pathlib import Path
+from typing import TypeVar
 
 from swarm.clock import NS_PER_S
 from swarm.config.input_files import FileKind
 from swarm.files import make_folder
 from swarm.journal import Journal
+
+K = TypeVar("K")
+V = TypeVar("V")
 
 HEARTBEAT_NS = NS_PER_S // 5
 """Period at which an unchanged statement is repeated: by it members know of a leader, and a leader of its hosts."""
@@ -25,6 +29,13 @@ _FURTHEST_GENERATION = 1 << 16
 def is_said(says: object, told: object, age_ns: int, again_ns: int = HEARTBEAT_NS) -> bool:
     """Returns True if the same was told a time ago after which it need not be repeated."""
     return says == told and 0 <= age_ns < again_ns
+
+
+def keep_last(kept: dict[K, V], key: K, value: V, most: int) -> None:
+    """Adds a value. The oldest goes if there are more than `most`."""
+    kept[key] = value
+    if len(kept) > most:
+        del kept[next(iter(kept))]
 
 
 def first_generation(after: int, chance: int) -> int:

@@ -10,15 +10,30 @@ from itertools import chain, takewhile
 
 import msgspec
 
-from swarm.right_of_way.generations import FURTHEST_EPOCH, HEARTBEAT_NS, is_said
+from swarm.right_of_way.generations import FURTHEST_EPOCH, HEARTBEAT_NS, is_said, keep_last
 from swarm.right_of_way.host_entries import BEFORE_ALL, HostEntries
 from swarm.right_of_way.shards import Shards
-from swarm.wire.messages.traffic import Entry, Granted, Held, HostState, Left, Number, Stand, Word, entries_of
+from swarm.wire.messages.traffic import (
+    Entry,
+    Granted,
+    Held,
+    HostState,
+    Left,
+    Number,
+    Stamp,
+    Stand,
+    Word,
+    entries_of,
+)
 
 _UNHEARD_NS = 5 * HEARTBEAT_NS // 2
 """A host that has not heard a shard's leader for this time speaks to all members of the shard."""
 _FURTHEST_SEQ = 1 << 32
 """Tables of one epoch: ten a second for thirteen years."""
+STATES_KEPT = 32
+"""Statements since which changes are sent: at ten a second more than are sent in a round trip."""
+TABLES_KEPT = 16
+"""Tables since which changes are sent, more than may be on the way at once: an older one is never asked for."""
 MOST_AHEAD = 16
 """Cells ahead that one statement may request."""
 _MOST_CELLS = 1 << 12
@@ -79,6 +94,8 @@ class _View:
     stands    vehicle that has a place -> the last statement about it
     told      what was news of the last statement about our vehicles, and its time
     same      whether the next statement is known to be the same
+    sent      seq -> host state, the last ones since the leader's first grant: it has that which it has `heard`
+    used      stamp -> grant, the last ones that were acted on
     """
 
     leader: str = ""
@@ -97,6 +114,8 @@ class _View:
     told: object = None
     told_ns: int = 0
     same: bool = False
+    sent: dict[int, HostState] = field(default_factory=dict)
+    used: dict[Stamp, Granted] = field(default_factory=dict)
 
 
 class _Said(msgspec.Struct, frozen=True):
@@ -284,11 +303,13 @@ class Holdings:
         if granted.agent != self.shards.leader(granted.shard, granted.epoch) or granted.stamp < knows:
             return []
         view.leader, view.heard_ns = granted.agent, now_ns
+        if (whole := granted.whole(view.used)) is None:
+            return []
         if not self.shards.proven:
-            return self._take(view, granted)
-        part = part_of(granted.generation, granted.grants, granted.waits)
-        view.words[granted.agent] = granted.epoch, part
-        view.pending[granted.agent] = granted, part
+            return self._take(view, whole)
+        part = part_of(whole.generation, whole.grants, whole.waits)
+        view.words[whole.agent] = whole.epoch, part
+        view.pending[whole.agent] = whole, part
         return self._take_agreed(view)
 
     def _hear_word(self, word: Word) -> list[str]:
@@ -328,6 +349,9 @@ class Holdings:
             self._say_all_again()
         if granted.stamp == knows or granted.generation != self.generation or self.replaced:
             return []  # what it grants was granted to another generation
+        if granted.epoch != knows[0]:
+            view.sent.clear()  # another leader has none of these
+        keep_last(view.used, granted.stamp, granted, TABLES_KEPT)
         view.heard, view.same = granted.heard, False
         view.pushed = {id: age for id, age in granted.pushed.items() if id in self._paths}
         view.others = frozenset(granted.occupied)
@@ -397,7 +421,7 @@ class Holdings:
                     self._say_entering(by_shard, shard, Stand(vehicle, cell, end, Held.of(held), [], [cell], 1, 0))
         self._forget_left(by_shard)
         return [
-            Tell(self._listeners(shard, now_ns), self._standing(shard, [stand for stand, _ in stands.values()]))
+            self._tell(shard, [stand for stand, _ in stands.values()], now_ns)
             for shard, stands in by_shard.items()
             if self._is_news(shard, stands, now_ns)
         ]
@@ -453,8 +477,10 @@ class Holdings:
         for view in self._views.values():
             view.same = False
 
-    def _standing(self, shard: int, stands: list[Stand]) -> HostState:
-        return HostState(
+    def _tell(self, shard: int, stands: list[Stand], now_ns: int) -> Tell:
+        """Returns the statement about these, for one leader as changes since one that it has."""
+        view, members = self._views[shard], self._listeners(shard, now_ns)
+        standing = HostState(
             shard=shard,
             agent=self.name,
             generation=self.generation,
@@ -465,6 +491,11 @@ class Holdings:
             ended=self.replaced,
             never=sorted(self._entries.never(shard)),
         )
+        # Of others than agents a leader keeps no earlier statement: a stranger costs it little memory.
+        reads = members == (view.leader,) and self.name in self.shards.agents
+        base = view.sent.get(view.heard) if reads else None
+        keep_last(view.sent, self._seq, standing, STATES_KEPT)
+        return Tell(members, standing if base is None else standing.changes(base))
 
     def _listeners(self, shard: int, now_ns: int) -> tuple[str, ...]:
         view = self._views[shard]

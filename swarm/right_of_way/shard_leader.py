@@ -17,7 +17,8 @@ from zlib import crc32
 from swarm.clock import NS_PER_S
 from swarm.config.agent_plan import agent_of
 from swarm.right_of_way.cell_orders import Orders, cells_beside
-from swarm.right_of_way.generations import HEARTBEAT_NS, is_far_ahead, is_said
+from swarm.right_of_way.generations import HEARTBEAT_NS, is_far_ahead, is_said, keep_last
+from swarm.right_of_way.holdings import STATES_KEPT, TABLES_KEPT
 from swarm.right_of_way.host import GENERATIONS_KEPT
 from swarm.right_of_way.pibt import Mover, Round
 from swarm.right_of_way.shards import Shards
@@ -41,8 +42,6 @@ MOST_CELLS_OF_EXTERNALS = 1 << 14
 (docs/design/external-vehicles.md)."""
 _MOST_BEFORE = 2
 """Entries that one may wait for: each more would hold up those behind it for longer."""
-TABLES_KEPT = 16
-"""More than may be on the way at once: an older one is never asked for."""
 MOST_CELLS = 42
 """Limit for one vehicle. Entries on two of three files are at most 63 then, as many as a `Held` takes."""
 
@@ -87,6 +86,8 @@ class _Host:
               request nothing now
     spoke_ns  time of the last message, of any of its generations: a replaced one is informed
     told      the last grant to it, and its time
+    said      (generation, seq) -> statement, the last ones of an agent
+    changes   whether the newest was sent as changes: then so are grants
     """
 
     spoke_ns: int
@@ -96,6 +97,8 @@ class _Host:
     heard_ns: int = 0
     told: object = None
     told_ns: int = 0
+    said: dict[Stamp, HostState] = field(default_factory=dict)
+    changes: bool = False
 
 
 @dataclass
@@ -161,6 +164,10 @@ class Leader:
             return
         if (standing.generation, standing.seq) <= (generation, seq):
             return
+        known.changes = standing.since > 0
+        if (whole := standing.whole(known.said)) is None:
+            return
+        standing = whole
         if is_far_ahead(standing.generation, generation):
             self.refused.append(f"{host} names a generation that is implausibly far ahead: {standing.generation}")
             return
@@ -194,6 +201,8 @@ class Leader:
         self._changed |= self._orders.by_host_count(host) != before
         self.seq = max(self.seq, self._orders.newest - 1)  # the next table is not older than its entries
         known.standing, known.stands, known.heard_ns = standing, stands, now_ns
+        if host in self._fleets:
+            keep_last(known.said, (standing.generation, standing.seq), standing, STATES_KEPT)
         known.asking = [stand for stand in stands.values() if stand.ahead or stand.cell == stand.end]
 
     def _is_welcome(self, host: str) -> bool:
@@ -223,9 +232,7 @@ class Leader:
             self.seq += 1
             stamp = self.epoch, self.seq
             self._told = self._orders.table(self._shard, self._me, stamp, self._pushed, self._without)
-            self._content[self._told.stamp] = self._content_of(self._told)
-            if len(self._content) > TABLES_KEPT:
-                del self._content[next(iter(self._content))]
+            keep_last(self._content, stamp, self._content_of(self._told), TABLES_KEPT)
         self._changed = self._granted = False
         self._told_ns = now_ns
         return self._told
@@ -241,7 +248,17 @@ class Leader:
             silent = now_ns - host.spoke_ns > SILENT_NS
             if not silent and not is_said(news, host.told, now_ns - host.told_ns, _TOLD_AGAIN_NS):
                 host.told, host.told_ns = news, now_ns
-                yield granted
+                yield self._since_used(granted, host)
+
+    def _since_used(self, granted: Granted, host: _Host) -> Granted:
+        """Returns a grant, to a host that sends changes as changes since the one that it has used."""
+        used = host.standing.knows if host.changes and host.standing is not None else (0, 0)
+        base, _ = self._content.get(used, {}).get(granted.host, (granted, None))
+        return (
+            granted.changes(base)
+            if base.stamp < granted.stamp and base.generation == granted.generation
+            else granted
+        )
 
     def _content_of(self, table: Table) -> dict[str, tuple[Granted, object]]:
         """Returns host -> its part of the table that has just been made, and what of that is news: not the number
@@ -266,7 +283,7 @@ class Leader:
                 waits=waits,
                 followed=followed.get(name, {}),
                 pushed={vehicle: age for vehicle, age in table.pushed.items() if vehicle in grants},
-                occupied=sorted((near & orders.orders.keys()).difference(orders.cells_of(name))),
+                occupied=orders.occupied(near, name),
             )
             news = grants, waits, granted.followed, granted.pushed, granted.occupied
             found[name] = granted, (generation, 0 if stands else heard, news)

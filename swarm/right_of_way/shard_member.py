@@ -10,8 +10,9 @@ from collections.abc import Collection, Mapping
 from dataclasses import InitVar, dataclass, field
 
 from swarm.clock import NS_PER_S
-from swarm.right_of_way.generations import FURTHEST_EPOCH, HEARTBEAT_NS
-from swarm.right_of_way.shard_leader import TABLES_KEPT, Leader
+from swarm.right_of_way.generations import FURTHEST_EPOCH, HEARTBEAT_NS, keep_last
+from swarm.right_of_way.holdings import TABLES_KEPT
+from swarm.right_of_way.shard_leader import Leader
 from swarm.right_of_way.shard_witness import Witness, agreed
 from swarm.right_of_way.shards import Shards
 from swarm.wire.messages.traffic import Granted, HostState, Stamp, Stored, Table, Word
@@ -175,9 +176,7 @@ class Member:
         if stamp in self._asked:
             self._asked[stamp] = -1
             return
-        self._asked[stamp] = now_ns
-        if len(self._asked) > _ASKED_KEPT:
-            del self._asked[next(iter(self._asked))]
+        keep_last(self._asked, stamp, now_ns, _ASKED_KEPT)
 
     def _answered(self, member: str, stamp: Stamp, now_ns: int) -> None:
         asked_ns = self._asked.get(stamp, -1)
@@ -232,12 +231,9 @@ class Member:
         self._led(now_ns, table.agent)
         actions: list[MemberAction] = []
         if table.stamp > self.stored.stamp:
-            if table.since is not None:
-                base = self._bases.get(table.since) if table.since[0] == table.epoch else None
-                whole = None if base is None else table.whole(base)
-                if whole is None:
-                    return [self.on_file]  # by which the leader knows what we lack
-                table = whole
+            if (whole := table.whole(self._bases)) is None:
+                return [self.on_file]  # by which the leader knows what we lack
+            table = whole
             if not self._accepts(table):
                 return self._words(now_ns)
             self.promised = table.epoch
@@ -251,9 +247,8 @@ class Member:
         return actions
 
     def _store(self, table: Table) -> None:
-        self.stored = self._bases[table.stamp] = table
-        if len(self._bases) > _BASES_KEPT:
-            del self._bases[next(iter(self._bases))]
+        self.stored = table
+        keep_last(self._bases, table.stamp, table, _BASES_KEPT)
 
     def _say(self, now_ns: int) -> Stored:
         self._said, self._said_ns = self.stored.stamp, now_ns

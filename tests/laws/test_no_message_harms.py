@@ -40,7 +40,7 @@ from swarm.peers import Peer
 from swarm.right_of_way.promise_store import PromiseStore
 from swarm.wire.access import Act, Authenticator
 from swarm.wire.codec import decode
-from swarm.wire.fields import OR_INFINITE, Column, taken_apart
+from swarm.wire.fields import LONGEST_LEASE_S, OR_INFINITE, Column, taken_apart
 from swarm.wire.messages.map_data import MarkKind
 from swarm.wire.messages.planning import RouteReply, RouteRequest
 from swarm.wire.route_columns import RouteStatus
@@ -351,16 +351,20 @@ def test_after_the_lies_each_service_does_its_work_again(run: str, state: str) -
     swarm = lied_to(run, state, 9, few(53), False, secret=False)
     swarm.run(8)
     [targets] = [each for name, each in swarm.services.items() if name == "targets-0"]
-    truth = targets._world._targets[swarm.target].walker.cell
+    walker = targets._world._targets[swarm.target].walker
     grid = swarm.terrain.grid
     planner, keeper = swarm.services[f"planner-{swarm.target}"], swarm.services["keeper-0"]
     agents = [each for each in swarm.services.values() if isinstance(each, AgentService)]
     own = {agent._author.rpartition(".")[0] for agent in agents}
     assert {author.rpartition(".")[0] for author in keeper.replica.held.ledger.authors_from(0, 1000)} <= own
     home = int(np.flatnonzero(np.isfinite(planner._cost_maps["ground"].pace_s_per_m))[0])
-    [reply] = swarm.routes(home)
+    for _ in range(int(LONGEST_LEASE_S)):  # for this time a lie about the target's place may stand
+        [reply] = swarm.routes(home)
+        if reply.target_cell is not None and grid.distance_cells(reply.target_cell, walker.cell) <= 3:
+            break
+        swarm.run(1)
     assert reply.target_cell is not None
-    assert grid.distance_cells(reply.target_cell, truth) <= 3
+    assert grid.distance_cells(reply.target_cell, walker.cell) <= 3
     assert reply.routes[0].status is RouteStatus.OK
     before = [vehicle.motion.place_m() for agent in agents for vehicle in agent.agent.vehicles.values()]
     swarm.run(8)

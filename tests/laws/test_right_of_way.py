@@ -9,6 +9,7 @@ More histories: `pytest tests/laws/test_right_of_way.py -m seeds --seeds 0:2000`
 """
 
 import random
+from collections import Counter
 from functools import cache
 from itertools import chain, pairwise
 
@@ -30,7 +31,7 @@ from swarm.right_of_way.holdings import Holdings
 from swarm.right_of_way.shard_leader import Leader
 from swarm.right_of_way.shard_member import Member
 from swarm.right_of_way.shards import Shards
-from swarm.wire.messages.traffic import Fence, Held, KnownRequest, Table
+from swarm.wire.messages.traffic import Fence, Granted, Held, HostState, KnownRequest, Table
 
 QUIET_S = 12.0
 SHAPES = ((3, 4, 9, 9), (4, 3, 10, 5), (8, 3, 14, 7), (2, 5, 8, 4), (5, 4, 12, 4), (1, 5, 7, 4))
@@ -111,6 +112,41 @@ def test_forty_agents_in_a_crowd() -> None:
     assert (
         sum(world.moves[vehicle] > before.get(vehicle, 0) for vehicle in world.moves) >= 190
     )  # the others wait their turn
+
+
+@pytest.mark.seeds(3)
+def test_changes_are_read_as_what_was_said(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whichever messages are lost, late or repeated, and whoever leads: nothing is read from a wrong base."""
+    said: dict[object, object] = {}
+    read = Counter[type]()
+
+    def content(message: HostState | Granted) -> object:
+        if isinstance(message, HostState):
+            return {stand.vehicle: stand for stand in message.vehicles}
+        return message.grants
+
+    def key(message: HostState | Granted) -> object:
+        if isinstance(message, HostState):
+            return message.agent, message.shard, message.generation, message.seq
+        return message.host, message.shard, message.generation, message.stamp
+
+    for kind in (HostState, Granted):
+
+        def changes(self, base, made=kind.changes):  # type: ignore[no-untyped-def]
+            said[key(self)] = content(self)
+            return made(self, base)
+
+        def whole(self, known, made=kind.whole):  # type: ignore[no-untyped-def]
+            found = made(self, known)
+            if self.since and found is not None:
+                assert content(found) == said[key(self)]
+                read[type(self)] += 1
+            return found
+
+        monkeypatch.setattr(kind, "changes", changes)
+        monkeypatch.setattr(kind, "whole", whole)
+    world_of(seed).run(QUIET_S + 4.0)
+    assert read[HostState] > 20 < read[Granted]
 
 
 def test_without_faults_everybody_gets_where_it_wants() -> None:

@@ -60,7 +60,7 @@ _NAMED: tuple[Message, ...] = (
         untils_ns=pack_column([40], "<i8"),
     ),
     HostState(
-        shard=0, agent="a0", generation=1 << 32, seq=9, knows=(3, 17), dead=[5],
+        shard=0, agent="a0", generation=1 << 32, seq=9, knows=(3, 17), dead=[5], since=8, gone=["a0-01"],
         vehicles=[Stand("a0-00", 4, 5, Held.of([(4, 3, 16), (5, 3, 16)]), [6], [], 0, 1200)],
     ),
     Table(

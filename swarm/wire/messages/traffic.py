@@ -3,7 +3,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from itertools import accumulate, chain, groupby, pairwise, repeat
 from typing import Annotated
 
@@ -82,6 +82,17 @@ class Held(msgspec.Struct, frozen=True, array_like=True):
 _NONE_HELD = Held()
 
 
+def _differing(grants: dict[str, Held], base: dict[str, Held]) -> dict[str, Held]:
+    """Returns the grants that differ from those before, an empty one for a vehicle that has none any more."""
+    changed = {vehicle: held for vehicle, held in grants.items() if base.get(vehicle) != held}
+    return changed | {vehicle: _NONE_HELD for vehicle in base if vehicle not in grants}
+
+
+def _merged(base: dict[str, Held], changes: dict[str, Held]) -> dict[str, Held]:
+    """Returns the grants of which `changes` differ from a base."""
+    return {vehicle: held for vehicle, held in (base | changes).items() if held.stamps}
+
+
 class Stand(fields.Part, frozen=True, array_like=True):
     """One vehicle, as its host tells it to the members of one shard.
 
@@ -117,6 +128,8 @@ class HostState(Message, frozen=True, kw_only=True, tag=schema_of("host-state", 
                 which this start has locked now
     ended       this start of the host has stopped driving, for good
     never       entries later than `knows` that this start does not hold, and never takes: members asked for them
+    since       seq of an earlier host state: `vehicles` has only the stands that differ from its, and `gone` its
+                vehicles which are not here any more. 0 if `vehicles` has all
     """
 
     shard: fields.Shard
@@ -128,6 +141,28 @@ class HostState(Message, frozen=True, kw_only=True, tag=schema_of("host-state", 
     dead: Annotated[list[fields.Natural], Meta(max_length=32)] = []
     ended: bool = False
     never: Annotated[list[Number], fields.SMALL] = []
+    since: fields.Natural = 0
+    gone: Annotated[list[fields.VehicleId], fields.SMALL] = []
+
+    def changes(self, base: HostState) -> HostState:
+        """Returns the same host state for a leader that has an earlier one of this generation."""
+        before = {stand.vehicle: stand for stand in base.vehicles}
+        vehicles = [stand for stand in self.vehicles if before.pop(stand.vehicle, None) != stand]
+        return replace(self, vehicles=vehicles, since=base.seq, gone=[*before])
+
+    def whole(self, known: Mapping[Stamp, HostState]) -> HostState | None:
+        """Returns the host state with all stands; None if its base is not among those known, by generation and
+        seq, or it is too large to be true."""
+        if not self.since:
+            return self
+        base = known.get((self.generation, self.since))
+        if base is None:
+            return None
+        stands = {stand.vehicle: stand for stand in chain(base.vehicles, self.vehicles)}
+        for vehicle in self.gone:
+            stands.pop(vehicle, None)
+        fits = len(stands) <= fields.MOST_VEHICLES
+        return replace(self, vehicles=[*stands.values()], since=0, gone=[]) if fits else None
 
 
 class Entry(msgspec.Struct, frozen=True, array_like=True):
@@ -192,16 +227,17 @@ class Table(Message, frozen=True, kw_only=True, tag=schema_of("table", 9)):
         if not base.hosts.keys() <= self.hosts.keys():
             return self
         hosts = {host: said for host, said in self.hosts.items() if base.hosts.get(host) != said}
-        grants = {vehicle: held for vehicle, held in self.grants.items() if base.grants.get(vehicle) != held}
-        grants.update((vehicle, _NONE_HELD) for vehicle in base.grants if vehicle not in self.grants)
-        return replace(self, hosts=hosts, grants=grants, since=base.stamp)
+        return replace(self, hosts=hosts, grants=_differing(self.grants, base.grants), since=base.stamp)
 
-    def whole(self, base: Table) -> Table | None:
-        """Returns the table of which this one has the changes since a base; None if it is too large to be true."""
-        hosts, grants = {**base.hosts, **self.hosts}, {**base.grants, **self.grants}
-        for vehicle, held in self.grants.items():
-            if not held.stamps:
-                del grants[vehicle]
+    def whole(self, known: Mapping[Stamp, Table]) -> Table | None:
+        """Returns the table with all entries; None if its base is not among those known, or it is too large to be
+        true."""
+        if self.since is None:
+            return self
+        base = known.get(self.since) if self.since[0] == self.epoch else None
+        if base is None:
+            return None
+        hosts, grants = base.hosts | self.hosts, _merged(base.grants, self.grants)
         fits = len(hosts) <= fields.MOST_IDS and len(grants) <= fields.MOST_LARGE
         return replace(self, hosts=hosts, grants=grants, since=None) if fits else None
 
@@ -226,6 +262,9 @@ class Granted(Message, frozen=True, kw_only=True, tag=schema_of("granted", 9)):
     followed           host -> entries of this one behind which its vehicles wait
     pushed             vehicle of the host -> the age with which it is to make way into another shard
     occupied           cells held by others near the ends of this host's paths
+    since              stamp of an earlier table, which the host has used: `grants` has only what differs from it,
+                       an empty one for a vehicle that has no entry any more. None if it has all. Sent to hosts
+                       which send changes, too
     """
 
     shard: fields.Shard
@@ -240,10 +279,23 @@ class Granted(Message, frozen=True, kw_only=True, tag=schema_of("granted", 9)):
     followed: Annotated[dict[fields.Id, Annotated[list[Number], fields.SMALL]], fields.IDS] = {}
     pushed: Annotated[dict[fields.VehicleId, Milliseconds], fields.SMALL] = {}
     occupied: Annotated[list[fields.Cell], fields.LARGE] = []
+    since: Stamp | None = None
 
     @property
     def stamp(self) -> Stamp:
         return self.epoch, self.seq
+
+    def changes(self, base: Granted) -> Granted:
+        """Returns the same grant for a host that has used an earlier one."""
+        return replace(self, grants=_differing(self.grants, base.grants), since=base.stamp)
+
+    def whole(self, known: Mapping[Stamp, Granted]) -> Granted | None:
+        """Returns the grant with all entries; None if its base is not among those known, or it is too large to be
+        true."""
+        base = self if self.since is None else known.get(self.since)
+        grants = {} if base is None else _merged(base.grants, self.grants)
+        fits = base is not None and len(grants) <= fields.MOST_VEHICLES
+        return replace(self, grants=grants, since=None) if fits else None
 
 
 class Word(Message, frozen=True, kw_only=True, tag=schema_of("word")):

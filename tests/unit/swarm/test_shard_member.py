@@ -115,7 +115,7 @@ def test_changes_of_a_later_epoch_end_a_leader_and_those_of_an_earlier_epoch_are
 def test_changes_make_no_table_that_is_larger_than_a_message_may_be() -> None:
     base = table_of(1, 3, **{f"a{n}": [n] for n in range(3)})
     more = replace(table_of(1, 4), hosts={f"h{n}": (1, 1) for n in range(MOST_IDS - 2)}, since=base.stamp)
-    assert more.whole(base) is None
+    assert more.whole({base.stamp: base}) is None
 
 
 def test_an_epoch_has_one_leader_only_though_a_promise_comes_twice() -> None:
