@@ -116,7 +116,7 @@ def test_forty_agents_in_a_crowd() -> None:
 
 @pytest.mark.seeds(3)
 def test_changes_are_read_as_what_was_said(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Whichever messages are lost, late or repeated, and whoever leads: nothing is read from a wrong base."""
+    """Whichever messages are lost, late or repeated: nothing is read from a wrong base."""
     said: dict[object, object] = {}
     read = Counter[type]()
 
