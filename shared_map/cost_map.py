@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shared_map.array_files import Bytes, Floats, private_copy
-from shared_map.learning.learned_factors import factors_in, keys_of
-from shared_map.learning.measurements import KEYS
+from shared_map.learned_factors import factors_in, keys_of
+from shared_map.pace_measurements import KEYS
 from shared_map.terrain.pace_layers import LETHAL, inflate, inflation_halves
 from shared_map.terrain.terrain import Terrain
 from swarm.errors import OutsideGridError

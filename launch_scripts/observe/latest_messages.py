@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 from launch_scripts.observe.summed_counts import Counts, sum_of
 from shared_map.replication.merge import winners
 from swarm.clock import NS_PER_S
-from swarm.config.agent_plan import agent_of, crew_of
-from swarm.config.scenario import Scenario
+from swarm.config.scenario import Scenario, agent_of, crew_of
 from swarm.grid import TILE_CELLS, GridSpec
 from swarm.peers import FOR_GOOD_NS, HIGHEST_RANK, Newest, Peer, ranked_id, split_rank
 from swarm.runtime.order_book import OrderBook

@@ -17,14 +17,12 @@ from typing import Any, Generic, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from launch_scripts.observe.fact_table import for_report, verdict
 from launch_scripts.observe.latest_messages import LatestState, VehicleColumns, plan_of
 from launch_scripts.observe.run_observer import TRACK_S
-from launch_scripts.observe.run_state import RunState, state_of
+from launch_scripts.observe.run_state import RunState, for_report, state_of, verdict
 from launch_scripts.observe.summed_counts import CertifiedGap, gap_of, gaps_of, gaps_to, of_excess
 from swarm.clock import NS_PER_S
-from swarm.config.agent_plan import agent_of, plan_agents
-from swarm.config.scenario import Scenario
+from swarm.config.scenario import Scenario, agent_of, plan_agents
 from swarm.config.vehicle_classes import GROUND, flies
 from swarm.grid import GridSpec
 from swarm.peers import Peer

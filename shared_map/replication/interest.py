@@ -15,8 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shared_map.replication.tiles import beyond_tile, of_all_classes, region_tiles
-from swarm.config.agent_plan import readable_groups
-from swarm.config.scenario import Scenario
+from swarm.config.scenario import Scenario, readable_groups
 from swarm.config.setting_types import RESERVED_GROUP
 from swarm.grid import REGION_CELLS, GridSpec
 

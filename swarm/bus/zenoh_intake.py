@@ -16,10 +16,10 @@ from typing import Any
 import zenoh
 
 from swarm.bus import bus
+from swarm.bus.bus import SHARED, check_meant, check_named
 from swarm.errors import ProtocolError
 from swarm.wire import codec
 from swarm.wire.access import Act, Authenticator, check_code
-from swarm.wire.meant_key import SHARED, check_meant, check_named
 from swarm.wire.messages import Message
 from swarm.wire.topics import Topic, check_size
 

@@ -4,11 +4,11 @@ restart.
 The map is divided into *shards* (`shards`). Three agents, or four where certificates prove names,
 are the *members* of a shard. One of them is its *leader*, by epoch and majority. A *host* is a process with
 vehicles in a shard or at its border. A *generation* is one numbered start of a host. The leader keeps an order of
-*entries* for each cell (`host_entries`): the vehicle of an entry enters the cell once all before it are over. An
+*entries* for each cell (`cell_orders`): the vehicle of an entry enters the cell once all before it are over. An
 entry is never revoked and never runs out: only its host ends it.
 
 The proof is in docs/design/right-of-way.md; docs/design/external-vehicles.md says how external vehicles come into
-it. Hosts: `host`, `holdings`, `host_entries`, `generations`. Members: `shard_leader`, `shard_member`, and, where
+it. Hosts: `host`, `holdings`, `generations`. Members: `shard_leader`, `shard_member`, and, where
 certificates prove names, `shard_witness`. An agent (`agent_core`) is both. `agent_session` and `external_session`
 carry the messages; `promise_store` and the file of generations keep what was said. All else is pure: time and
 chance are arguments.

@@ -10,8 +10,8 @@ from itertools import chain, takewhile
 
 import msgspec
 
+from swarm.right_of_way.cell_orders import BEFORE_ALL, HostEntries
 from swarm.right_of_way.generations import FURTHEST_EPOCH, HEARTBEAT_NS, is_said
-from swarm.right_of_way.host_entries import BEFORE_ALL, HostEntries
 from swarm.right_of_way.shards import Shards
 from swarm.wire.messages.traffic import Entry, Granted, Held, HostState, Left, Number, Stand, Word, entries_of
 

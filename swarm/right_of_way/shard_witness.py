@@ -14,12 +14,11 @@ from itertools import chain
 
 from msgspec.structs import replace
 
-from swarm.config.agent_plan import agent_of
-from swarm.right_of_way.cell_orders import Orders
+from swarm.config.scenario import agent_of
+from swarm.right_of_way.cell_orders import BEFORE_ALL, Orders
 from swarm.right_of_way.generations import is_said
 from swarm.right_of_way.holdings import part_of
 from swarm.right_of_way.host import GENERATIONS_KEPT
-from swarm.right_of_way.host_entries import BEFORE_ALL
 from swarm.right_of_way.shard_leader import MOST_CELLS, SILENT_NS, exceeds_externals, is_entering
 from swarm.right_of_way.shards import Shards
 from swarm.wire.messages.traffic import Fence, Held, HostState, Number, Stamp, Table, Word

@@ -24,9 +24,8 @@ from zlib import crc32
 
 from swarm.bus.bus import Event, Post, WorkDone
 from swarm.clock import NS_PER_S, Clock
-from swarm.runtime.first_use import in_loop
 from swarm.runtime.inbox import Inbox
-from swarm.runtime.loop_health import Health
+from swarm.runtime.loop_health import Health, in_loop
 from swarm.runtime.stats import CPU_S, ENDED, FIRST_USES, RSS_BYTES, Counters
 
 if TYPE_CHECKING:

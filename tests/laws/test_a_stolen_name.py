@@ -16,9 +16,9 @@ from support.thief import Thief, ThiefWorld
 from support.traffic_world import Faults, Process, TrafficWorld, random_faults
 
 from swarm.right_of_way import shard_member
+from swarm.right_of_way.cell_orders import HostEntries
 from swarm.right_of_way.holdings import Holdings
 from swarm.right_of_way.host import GENERATIONS_KEPT
-from swarm.right_of_way.host_entries import HostEntries
 from swarm.right_of_way.shard_member import Member
 from swarm.right_of_way.shard_witness import Witness, _Host
 from swarm.right_of_way.shards import Shards

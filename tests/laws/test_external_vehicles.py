@@ -13,11 +13,10 @@ from support import broken_rules as rules
 from support.external_world import ExternalProcess, ExternalWorld
 from support.traffic_world import Faults, random_faults
 
-from swarm.config.agent_plan import agent_of
-from swarm.right_of_way.cell_orders import Orders
+from swarm.config.scenario import agent_of
+from swarm.right_of_way.cell_orders import HostEntries, Orders
 from swarm.right_of_way.external_vehicle import ExternalVehicle
 from swarm.right_of_way.host import Host
-from swarm.right_of_way.host_entries import HostEntries
 from swarm.right_of_way.shard_leader import SILENT_NS, Leader
 
 QUIET_S = 12.0

@@ -22,7 +22,7 @@ from support.shard_tables import AGENTS, MEMBERS, SHARDS, standing, table_of
 from support.traffic_world import TICK_NS, Faults, Process, TrafficWorld, random_faults
 
 from swarm.grid import GridSpec
-from swarm.right_of_way import host_entries
+from swarm.right_of_way import cell_orders
 from swarm.right_of_way.agent_core import OwnRecord, RightOfWay
 from swarm.right_of_way.agent_session import OwnTime
 from swarm.right_of_way.cell_orders import Orders
@@ -70,7 +70,7 @@ def assert_remembers_what_is_not_over(process: Process) -> None:
     entries = process.rights.host._entries
     for shard, over in entries.over.items():
         assert over <= {*chain(*entries.listed.get(shard, {}).values())}
-    assert len(entries.heard) <= host_entries._MOST_HEARD
+    assert len(entries.heard) <= cell_orders._MOST_HEARD
     for leader in (member.leader for member in process.rights._members.values() if member.leader is not None):
         kept = leader._orders
         anew = Orders(kept.table(0, "a0", (0, 0), {}, {}))
@@ -81,7 +81,7 @@ def assert_remembers_what_is_not_over(process: Process) -> None:
 @pytest.mark.seeds(24)
 def test_no_two_meet_and_all_move_again_when_it_is_quiet(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
     """Also where hosts remember few words of others: these are told again."""
-    monkeypatch.setattr(host_entries, "_MOST_HEARD", 40)
+    monkeypatch.setattr(cell_orders, "_MOST_HEARD", 40)
     check(world_of(seed))
 
 

@@ -7,8 +7,7 @@ from collections.abc import Callable
 import pytest
 from support.traffic_world import TrafficWorld
 
-from swarm.right_of_way.cell_orders import Orders
-from swarm.right_of_way.host_entries import BEFORE_ALL, HostEntries
+from swarm.right_of_way.cell_orders import BEFORE_ALL, HostEntries, Orders
 from swarm.wire.messages.traffic import Entry
 
 Broken = Callable[[pytest.MonkeyPatch], None]

@@ -18,8 +18,10 @@ from support.effort import few
 from support.ros_messages import path
 from support.ros_node import FakeNode
 
-from launch_scripts.gateways.ros2.gateway_settings import Robots
-from launch_scripts.gateways.ros2.incoming.ros_places import (
+from launch_scripts.gateways.ros2.gateway_settings import INCOMING, Robots
+from launch_scripts.gateways.ros2.ros_messages import RosMap, RosMessages, quaternion_of
+from launch_scripts.gateways.ros2.ros_node import Input, WorkQueue
+from launch_scripts.gateways.ros2.ros_places import (
     MOST_CELLS,
     FrameReader,
     Place,
@@ -28,10 +30,7 @@ from launch_scripts.gateways.ros2.incoming.ros_places import (
     corners_of,
     robot_place,
 )
-from launch_scripts.gateways.ros2.ros_messages import RosMap, RosMessages, quaternion_of
-from launch_scripts.gateways.ros2.ros_node import Input, WorkQueue
 from launch_scripts.gateways.ros2.ros_types import types_of
-from launch_scripts.gateways.ros2.topic_table import INCOMING
 from swarm.clock import NS_PER_S
 from swarm.errors import ConfigError, ProtocolError
 from swarm.grid import GridSpec
