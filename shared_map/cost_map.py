@@ -225,11 +225,11 @@ def cluster(cells: NDArray[np.int64], cols: int) -> list[Window]:
     if len(tiles) > _MANY_BOXES and np.count_nonzero(np.bincount(tiles)) > _MANY_BOXES:
         # A late join: to look which of thousands touch would take longer than to join.
         return [Window(int(rows.min()), int(columns.min()), int(rows.max()) + 1, int(columns.max()) + 1)]
-    order = np.argsort(tiles, kind="stable")
-    starts = np.flatnonzero(np.diff(tiles[order], prepend=-1))
-    rows, columns = rows[order], columns[order]
-    tops, bottoms = np.minimum.reduceat(rows, starts), np.maximum.reduceat(rows, starts)
-    lefts, rights = np.minimum.reduceat(columns, starts), np.maximum.reduceat(columns, starts)
+    by_tile = np.argsort(tiles, kind="stable")
+    tile_starts = np.flatnonzero(np.diff(tiles[by_tile], prepend=-1))
+    rows, columns = rows[by_tile], columns[by_tile]
+    tops, bottoms = np.minimum.reduceat(rows, tile_starts), np.maximum.reduceat(rows, tile_starts)
+    lefts, rights = np.minimum.reduceat(columns, tile_starts), np.maximum.reduceat(columns, tile_starts)
     boxes = zip(tops.tolist(), lefts.tolist(), bottoms.tolist(), rights.tolist(), strict=True)
     return merged([Window(top, left, bottom + 1, right + 1) for top, left, bottom, right in boxes])
 

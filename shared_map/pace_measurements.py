@@ -107,10 +107,10 @@ class TrimmedMean:
 
     def add(self, y: int) -> None:
         """Takes in y of one more cell."""
-        one = self._bins.setdefault(y // _BIN, [0, 0, 0])
-        one[0] += 1
-        one[1] += y
-        one[2] += y * y
+        bin_sums = self._bins.setdefault(y // _BIN, [0, 0, 0])
+        bin_sums[0] += 1
+        bin_sums[1] += y
+        bin_sums[2] += y * y
         self.cells += 1
 
     @property

@@ -47,7 +47,7 @@ from swarm.wire.messages.processes import RunInfo
 PROVED_AFTER_S = 1.5
 """A connection that lasts for this time has a certificate: Zenoh ends a handshake that takes `HANDSHAKE_S`."""
 HANDSHAKE_S = 1.0
-"""Limit of a TLS handshake, which `router.py` sets. Chosen, not measured."""
+"""Limit of a TLS handshake, which the router sets. Chosen, not measured."""
 PROVED_BY_REPLIES = 4
 """A router replies three times at most to a handshake that fails: HelloRetryRequest, its own part, an alert."""
 HELLO_WITHIN_S = 2.0

@@ -49,7 +49,7 @@ from swarm.errors import ConfigError
 MOST_TRIALS = 1_000_000
 """A larger number is a slip. Chosen, not measured."""
 SMALL_WORLDS = (MIX, *WORLDS)
-STUDIES = Path(__file__).parents[2] / "studies"
+STUDIES = Path(__file__).parents[1] / "studies"
 """The project's own."""
 Shown = Annotated[
     str, Meta(pattern=r"^[^\x00-\x1f\x7f-\x9f]{1,200}\Z", description="1 to 200 characters that print")
@@ -208,15 +208,15 @@ def _settings(scenario: Scenario) -> Any:
     settings = msgspec.to_builtins(scenario)
     del settings["seed"], settings["seconds"]
     settings["plugin_folder"] = {place: _file_digest(path) for place, path in plugin_files(scenario).items()}
-    return _with_content(settings)
+    return _with_file_content(settings)
 
 
-def _with_content(value: Any) -> Any:
+def _with_file_content(value: Any) -> Any:
     match value:
         case dict():
-            return {key: _with_content(each) for key, each in value.items()}
+            return {key: _with_file_content(each) for key, each in value.items()}
         case list() | tuple():
-            return [_with_content(each) for each in value]
+            return [_with_file_content(each) for each in value]
         case str() if value.startswith("/") and Path(value).is_file():
             return {"file": [_file_digest(path) for path in (Path(value), *parts_of(Path(value)))]}
     return value

@@ -189,7 +189,7 @@ def _bucket(at, now, level):
 
 
 @helper
-def _choose(cost, inverse, served, level, cells, count, waiting, buckets):
+def _choose_buckets(cost, inverse, served, level, cells, count, waiting, buckets):
     """buckets := where each cell is to wait: at `level` or above."""
     if level > _ZERO or served >= _SURE:
         shift = level * _DIGIT
@@ -250,10 +250,10 @@ def _put_back(cost, inverse, served, level, batch, n, least, scratch):
         count += np.uint64(late)
         kept += np.uint64(not late)
         if count == room:
-            _choose(cost, inverse, served, level, touched, count, waiting, chosen)
+            _choose_buckets(cost, inverse, served, level, touched, count, waiting, chosen)
             put(queue, touched, count, chosen, _MASK, _ZERO)
             count = _ZERO
-    _choose(cost, inverse, served, level, touched, count, waiting, chosen)
+    _choose_buckets(cost, inverse, served, level, touched, count, waiting, chosen)
     put(queue, touched, count, chosen, _MASK, _ZERO)
     return kept
 
@@ -269,7 +269,7 @@ def _serve(grid, cost, climbs, inverse, served, level, n, scratch):
     while first < n:
         some = min(_PIECE, n - first)
         count = _offer(cell_cost, cost, climbs, s, rule == RULE_FOUR, corners, batch, first, some, steps, touched)
-        _choose(cost, inverse, served, level, touched, count, waiting, chosen)
+        _choose_buckets(cost, inverse, served, level, touched, count, waiting, chosen)
         put(queue, touched, count, chosen, _MASK, _ZERO)
         first += some
 

@@ -353,20 +353,20 @@ def cut_parents(grid, tree, across, cells, before, changed):
     cell_cost, offsets, stride, _, corners = grid
     parent = tree.parent
     for j in range(cells.size):
-        x = cells[j]
-        t, _ = tile_pieces.tile_of(x, stride, across)
-        what = tile_pieces.COSTLIER if cell_cost[x] > before[j] else tile_pieces.ALTERED
+        changed_cell = cells[j]
+        t, _ = tile_pieces.tile_of(changed_cell, stride, across)
+        what = tile_pieces.COSTLIER if cell_cost[changed_cell] > before[j] else tile_pieces.ALTERED
         changed[t] |= what
-        lethal = not cell_cost[x] < INF and before[j] < INF
+        lethal = not cell_cost[changed_cell] < INF and before[j] < INF
         if lethal:
-            parent[x] = NONE
+            parent[changed_cell] = NONE
         for code in range(8):
-            v = x + offsets[code]
+            v = changed_cell + offsets[code]
             way = parent[v]
             if way == NONE:
                 continue
             into = way == (code + 4) & 7
-            if into or (lethal and not corners and cuts_corner(v, way, x, offsets)):
+            if into or (lethal and not corners and cuts_corner(v, way, changed_cell, offsets)):
                 t, _ = tile_pieces.tile_of(v, stride, across)
                 changed[t] |= what
                 if lethal:

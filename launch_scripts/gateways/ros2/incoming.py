@@ -32,7 +32,7 @@ from launch_scripts.gateways.ros2.gateway_settings import (
 from launch_scripts.gateways.ros2.rmw import Endpoint, Kind
 from launch_scripts.gateways.ros2.ros_messages import Level, RosMessages, ros_name
 from launch_scripts.gateways.ros2.ros_node import Input, Node, WorkQueue
-from launch_scripts.gateways.ros2.ros_places import FrameReader, Place, Track, closed_cells, corners_of
+from launch_scripts.gateways.ros2.ros_places import FrameReader, Place, RobotTrack, closed_cells, corners_of
 from launch_scripts.gateways.ros2.ros_types import LARGEST_MESSAGE_BYTES, RESPONSE
 from launch_scripts.plain_text import number_of
 from swarm.client import ConfigError, Route, Stream, Swarm, SwarmError, Vehicle
@@ -79,7 +79,7 @@ class Robot:
         self._robots, self._node, self._swarm, self._routes, self._messages = robots, node, swarm, routes, messages
         self._is_taken = is_taken
         self._reader = FrameReader(messages.map, own(robots.frame), robots.offset_m, robots.turn_rad)
-        self._track = Track(self._reader, robots.lease_s)
+        self._track = RobotTrack(self._reader, robots.lease_s)
         self._vehicle: Vehicle | None = None
         self._followed: Stream[Route] | None = None
         """Routes to the target or the place that it follows."""

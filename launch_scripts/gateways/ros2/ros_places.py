@@ -129,7 +129,7 @@ def robot_place(reader: FrameReader, message: Any) -> Place:
     return Place(place.x_m, place.y_m, heading_rad, speed)
 
 
-class Track:
+class RobotTrack:
     """One robot's messages, over time: where it is, and when it is none any more.
 
     Only the time of arrival counts: clocks of robots may be simulated, leap or stand still.
