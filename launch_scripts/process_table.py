@@ -10,8 +10,7 @@ from typing import Literal
 
 import msgspec
 
-from swarm.config.agent_plan import places_of, plan_agents
-from swarm.config.scenario import Scenario, ids_of
+from swarm.config.scenario import Scenario, ids_of, places_of, plan_agents
 from swarm.errors import ConfigError
 from swarm.peers import ranked_id
 from swarm.wire.fields import check_id

@@ -179,7 +179,7 @@ def complete_scenarios(ctx: typer.Context, incomplete: str) -> list[str]:
 
 def complete_runs(ctx: typer.Context, incomplete: str) -> list[str]:
     """Names of the runs in --runs and of those that are registered, the newest first, and LAST."""
-    from launch_scripts.observe.local_runs import registered
+    from launch_scripts.observe.run_folders import registered
 
     names = {run.name for run in registered()}
     with contextlib.suppress(OSError):

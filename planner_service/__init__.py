@@ -4,7 +4,7 @@ Every route of a planner leads over passable cells of the map as the planner kno
 bound of the cost of any route. The planner ensures this in six steps:
 
 1. *Map.* Marks come in by replication; the cost map says which windows have changed (`service`, `planner`).
-2. *Intake.* Changes that no follower's route passes wait for a second at most (`map_intake.MapIntake`).
+2. *Intake.* Changes that no follower's route passes wait for a second at most (`followers.MapIntake`).
 3. *Repair.* Costs that have risen detach what hung on them, costs that have fallen spread (`kernels.repair`).
 4. *Move.* The tree is led to the target's new cell: a window around it is grown, then, under an exact strategy, all
    costs are made exact by the parents (`kernels.costs_from_parents`, or `kernels.partition*` on large maps). If
@@ -46,7 +46,7 @@ standby       as above, but it pushes nothing                 the leader falls s
                                                               to every follower
 ============  ==============================================  =====================================================
 
-The tree's own states are `target_tree.State`; `search.search_triggers` holds whether a search runs, the candidacy
+The tree's own states are `target_tree.State`; `target_search` holds whether a search runs, the candidacy
 which process leads. The same without a process, a network or a file:
 
 >>> import numpy as np

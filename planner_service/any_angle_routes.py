@@ -1,4 +1,4 @@
-"""Routes of a planner, pulled straight (`kernels.pull_routes`)."""
+"""Routes of a planner, pulled straight (`kernels.route_kernels`)."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shared_map.array_files import Floats
-from shared_map.terrain.step_climb import Climb, may_be_pulled
+from shared_map.terrain.slope_and_climb import Climb, may_be_pulled
 from swarm.config.scenario import PlannerConfig
 from swarm.wire.route_columns import RouteBatch
 
@@ -46,7 +46,7 @@ class Puller:
         # Compiled only for planners of any-angle routes: no other process waits for it at a first start.
         from planner_service.kernels.decorators import load
         from planner_service.kernels.layout import step_offsets
-        from planner_service.kernels.pull_routes import ALL_CORNERS, NO_CORNERS, OPEN_CORNERS, pull_routes
+        from planner_service.kernels.route_kernels import ALL_CORNERS, NO_CORNERS, OPEN_CORNERS, pull_routes
 
         self._metres = resolution_m
         self._pace, self._offsets = pace.reshape(-1), step_offsets(pace.shape[1])

@@ -1,4 +1,18 @@
-"""The vehicles that follow one target, or go to places: their routes, and whose is due to be pushed. Pure."""
+"""The vehicles that follow one target, or go to places: their routes, and whose is due to be pushed. Pure.
+
+`MapIntake` decides which map changes wait for the tree, and for how long. To repair a tree costs about the same
+however many cells have changed. With hundreds of vehicles that see something new in every tick, somewhere, a
+planner that repaired in every tick did little else. A change that no follower's route passes is nothing to push; so
+it waits, but not long. Any change is applied within about a second, after the pause that `planner.cpu_budget`
+demands (`Planner`); no served route passes a waiting change.
+
+`GapStatistics` has the gap of their routes to the optimum:
+
+certified_gap_excess  proven, of every route served: its cost over its lower bound, less 1
+gap_excess            measured at full growths: cost of each follower's old route over the new optimum, less 1
+broken_certificates   routes whose cost is below their lower bound, and offers below what an exact tree proves:
+                      none, unless there is a bug
+"""
 
 from __future__ import annotations
 
@@ -9,10 +23,15 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from planner_service.target_tree import TargetTree
+from shared_map.cost_map import CostMap
+from swarm.clock import NS_PER_S
+from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec, Window, step_offsets, walk
+from swarm.runtime.stats import Counters
 from swarm.wire.fields import column
 from swarm.wire.messages.vehicles import Chasers
-from swarm.wire.route_columns import Route, RouteBatch, RouteOutline, RouteStatus
+from swarm.wire.route_columns import LETHAL_START, UNREACHABLE, Route, RouteBatch, RouteOutline, RouteStatus
 
 _NOWHERE_BOUNDS = (0, 0, 0, 0)
 """An empty window, which no change of the map touches."""
@@ -285,3 +304,104 @@ class Followers:
         near = (row0 < each[2]) & (each[0] < row1) & (col0 < each[3]) & (each[1] < col1)
         for n, m in zip(*map(np.ndarray.tolist, near.nonzero()), strict=True):
             yield followers[n], windows[m]
+
+
+LONGEST_WAIT_NS = NS_PER_S
+"""A change waits no longer, however seldom routes are pushed."""
+
+
+class MapIntake:
+    """Changes of one map that the tree of one target does not know, and whether they may wait."""
+
+    def __init__(self, cost_map: CostMap, followers: Followers) -> None:
+        self._cost_map = cost_map
+        self._followers = followers
+        self._taken_ns: int | None = None
+        """Time of the last ones; None before."""
+
+    def take(self, now_ns: int) -> list[Window]:
+        """Returns the changes since the last call, for the tree to apply now."""
+        if self._cost_map.dirty:
+            self._taken_ns = now_ns
+        return self._cost_map.take_dirty()
+
+    def is_due(self, now_ns: int, wait_ns: int) -> bool:
+        """Returns True if waiting changes are to be applied now: because the last update was so long ago, or
+        because they lie on the route of a follower that may be pushed another."""
+        wait_ns = min(wait_ns, LONGEST_WAIT_NS)
+        if self._taken_ns is None or not 0 <= now_ns - self._taken_ns < wait_ns:
+            return True
+        return self._followers.any_due_in(self._cost_map.dirty, now_ns)
+
+    def concerns(self, routes: RouteBatch) -> bool:
+        """Returns True if waiting changes lie on one of these routes or next to it, or may open a path where there
+        is none."""
+        windows = self._cost_map.dirty
+        if not windows:
+            return False
+        statuses = routes.statuses.tobytes()
+        if UNREACHABLE in statuses or LETHAL_START in statuses:
+            return True
+        rows, cols = routes.places(self._cost_map.grid)
+        if not rows.size:
+            return False
+        bounds = Window(int(rows.min()), int(cols.min()), int(rows.max()) + 1, int(cols.max()) + 1)
+        return any(
+            bool(np.any((rows >= w.row0 - 1) & (rows <= w.row1) & (cols >= w.col0 - 1) & (cols <= w.col1)))
+            for w in windows
+            if w.touches(bounds)
+        )
+
+
+_EVERY_NS = NS_PER_S
+_MOST = 64
+"""Followers that are measured at a time, evenly chosen: to read a route takes as long as a small growth."""
+
+Gaps = NDArray[np.float64]
+
+
+class GapStatistics:
+    """Measured gaps of one planner's routes. `last` is mean, p95 and highest of the last full growth."""
+
+    def __init__(self, config: PlannerConfig, counters: Counters) -> None:
+        self.last: tuple[float, float, float] | None = None
+        self._counters = counters
+        self._length_weight = config.length_weight
+        self._due_ns = 0
+
+    def certify(self, routes: RouteBatch) -> float:
+        """Notes the proven gaps of served routes. Returns the widest, at least 1."""
+        gaps = routes.gaps
+        # The histogram would take a route below its bound for one that is proven optimal.
+        self._count_broken(int(np.count_nonzero(routes.lower_bound_s > routes.cost_s)))
+        self._counters.observe_all("certified_gap_excess", gaps - 1.0)
+        return float(gaps.max(initial=1.0))
+
+    def adopted(self, tree: TargetTree, now_ns: int) -> None:
+        """A worker's tree has replaced the one that was offered until now, and has been compared with it."""
+        self._offered(tree.last_gaps)
+        self._count_broken(int(np.count_nonzero(tree.last_gaps < 1.0)))
+        self._due_ns = now_ns + _EVERY_NS
+
+    def record_growth(self, tree: TargetTree, followers: Followers, now_ns: int) -> None:
+        """A tree was grown on this thread: what it offers is read and compared with what it promises."""
+        if now_ns < self._due_ns or not len(followers):
+            return
+        self._due_ns = now_ns + _EVERY_NS
+        every = followers.cells
+        cells = every[:: -(-every.size // _MOST)]
+        routes = tree.routes(cells, 0)
+        driven = routes.cost_s + self._length_weight * routes.length_m
+        optimum = tree.cost_to_go_at(cells).astype(np.float64)
+        given = np.isfinite(driven) & np.isfinite(optimum) & (optimum > 0)
+        self._offered(driven[given] / optimum[given])
+
+    def _offered(self, gaps: Gaps) -> None:
+        gaps = gaps[np.isfinite(gaps)]
+        if not len(gaps):
+            return
+        self.last = (float(gaps.mean()), float(np.quantile(gaps, 0.95)), float(gaps.max()))
+        self._counters.observe_all("gap_excess", gaps - 1.0)
+
+    def _count_broken(self, many: int) -> None:
+        self._counters.count("broken_certificates", many)

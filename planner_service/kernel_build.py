@@ -26,42 +26,39 @@ from typing import Any
 from planner_service.kernels import (
     cell_costs,
     costs_from_parents,
-    cut_trees,
+    heap_and_buckets,
     lower_bounds,
     parents_from_costs,
-    partition,
-    partition_search,
-    partition_totals,
-    pull_routes,
+    piece_totals,
     queue_dial,
     queue_directed,
-    queue_heap,
     queue_wide_buckets,
     repair,
-    route_walk,
-    stride_growth,
-    stride_network,
+    route_kernels,
+    stride_networks,
+    tile_pieces,
+    tile_search,
 )
 from planner_service.kernels.decorators import BEFORE_LOAD, StepKernel, cache_folder, is_loaded, is_on_disk, load
 from swarm.config.scenario import Scenario
 from swarm.config.vehicle_classes import aloft_classes, first_classes
-from swarm.runtime.first_use import note
+from swarm.runtime.loop_health import note
 
 BEFORE_LOAD.append(note)
 Kernel = Any
 """Result of `kernels.decorators.kernel`; numba has no types."""
 
 FIRST: tuple[Kernel | StepKernel, ...] = (
-    route_walk.walk_routes,
+    route_kernels.walk_routes,
     StepKernel(queue_dial.grow_by_buckets, queue_directed.grow_directed_by_buckets),
     parents_from_costs.point_to_parents,
     StepKernel(queue_wide_buckets.grow_by_wide_buckets, None),
     parents_from_costs.untie_parents,
-    StepKernel(cut_trees.box_of, None),
-    StepKernel(cut_trees.point_routes, None),
+    StepKernel(route_kernels.box_of, None),
+    StepKernel(route_kernels.point_routes, None),
     cell_costs.pad_cell_costs,
     cell_costs.changed_cells,
-    route_walk.drive_rests,
+    route_kernels.drive_rests,
     lower_bounds.bound_costs,
     cell_costs.block_ranges,
     cell_costs.count_classes,
@@ -72,30 +69,30 @@ compile comes first, so that builders end together."""
 LATER: tuple[Kernel | StepKernel, ...] = (
     costs_from_parents.mend,
     repair.repair,
-    stride_growth.grow_strides,
+    stride_networks.grow_strides,
     cell_costs.cut_window,
     cell_costs.merge_window,
     cell_costs.find_rim,
-    stride_network.cut_blocks,
-    stride_network.find_ways_to_centres,
-    stride_network.join_nodes,
-    stride_growth.tighten,
-    stride_network.write_paths,
-    partition_search.improve_tiles,
-    partition.relabel_tiles,
-    partition_totals.add_up,
-    partition_search.cut_parents,
-    partition_search.merge_parents,
-    partition_search.drop_cut_off,
-    partition_totals.costs_at,
-    queue_heap.arrivals,
+    stride_networks.cut_blocks,
+    stride_networks.find_ways_to_centres,
+    stride_networks.join_nodes,
+    stride_networks.tighten,
+    stride_networks.write_paths,
+    tile_search.improve_tiles,
+    tile_pieces.relabel_tiles,
+    piece_totals.add_up,
+    tile_search.cut_parents,
+    tile_search.merge_parents,
+    tile_search.drop_cut_off,
+    piece_totals.costs_at,
+    heap_and_buckets.arrivals,
 )
 """For windows, repairs, strides and pieces, which save growing whole trees."""
 
-GOALS = cut_trees.walk_by_costs, queue_dial.resume, cut_trees.stays_exact
+GOALS = route_kernels.walk_by_costs, queue_dial.resume, route_kernels.stays_exact
 """Beside those of `FIRST`, for `GoalTrees`."""
 
-PULL = pull_routes.pull_routes
+PULL = route_kernels.pull_routes
 """Only for planners that pull their routes."""
 
 _POLL_S = 0.1

@@ -10,8 +10,7 @@ from contextlib import closing
 from planner_service.growth_times import is_slow_to_grow
 from planner_service.kernel_build import KernelLoader, NeededKernels, needed_kernels, place_kernels
 from planner_service.places_service import PlacesService
-from planner_service.planning_process import Planning
-from planner_service.prepared_costs import PREPARED_COSTS, prepared_costs
+from planner_service.planning_process import PREPARED_COSTS, Planning, prepared_costs
 from planner_service.service import PlannerService
 from shared_map.terrain.store import load_terrain
 from shared_map.terrain.terrain import Terrain
@@ -19,7 +18,7 @@ from shared_map.vehicle_class_grounds import load_classes
 from swarm.bus.bus import Bus
 from swarm.errors import ConfigError
 from swarm.peers import job_of
-from swarm.recording.role_process import run_role
+from swarm.recording.record_inputs import run_role
 from swarm.recording.service_boundary import Boundary
 from swarm.runtime.inbox import Inbox
 from swarm.runtime.process import JobSlots, Service, ThreadWorker, tick_phase

@@ -30,7 +30,7 @@ from shared_map.array_files import Floats
 from shared_map.cost_map import CostMap
 from swarm.bus.bus import Asked, Event, LinkChanged, WorkDone
 from swarm.clock import NS_PER_S
-from swarm.config import agent_plan
+from swarm.config import scenario as settings
 from swarm.config.scenario import PlannerConfig
 from swarm.config.vehicle_classes import GROUND
 from swarm.grid import Window
@@ -193,12 +193,12 @@ class PlacesService(PlanningProcess):
     def __init__(self, planning: Planning, all_kernels: Callable[[], bool] | None = None) -> None:
         job, scenario = job_of(planning.setup.id), planning.setup.scenario
         served = {PLACE_ROUTE: {"places": job}}
-        super().__init__(planning, agent_plan.readable_groups(scenario, job), served, all_kernels)
+        super().__init__(planning, settings.readable_groups(scenario, job), served, all_kernels)
         self._push_ns = int(scenario.planner.push_s * NS_PER_S)
         self._foreign = {
             asker_of("agent", plan.id): plan.group.name
-            for plan in agent_plan.plan_agents(scenario)
-            if agent_plan.place_job(scenario, plan.group.name) != job
+            for plan in settings.plan_agents(scenario)
+            if settings.place_job(scenario, plan.group.name) != job
         }
         """The agents which may not know what this process knows, and their groups. Routers hold an asker's name
         against its certificate."""
@@ -319,7 +319,7 @@ class PlacesService(PlanningProcess):
         if trees is None:
             scenario, cost_map = self._scenario, self._cost_maps[name]
             padded = (cost_map.grid.rows + 2) * (cost_map.grid.cols + 2)
-            budget = agent_plan.place_trees_bytes(agent_plan.PLACE_TREES_BYTES, len(self._cost_maps), padded)
+            budget = settings.place_trees_bytes(settings.PLACE_TREES_BYTES, len(self._cost_maps), padded)
             trees = _ClassTrees(cost_map, scenario.planner, budget, scenario.vehicles.route_cells)
             self._classes[name] = trees
             log.info("places of %s: trees for the class %s", self._job, name)
@@ -432,5 +432,5 @@ class PlacesService(PlanningProcess):
 
 def _asker(vehicle: str) -> str:
     """The name under which the agent of a vehicle asks, or a rover, which is its own agent."""
-    agent = agent_plan.agent_of(vehicle)
+    agent = settings.agent_of(vehicle)
     return asker_of("rover" if agent == vehicle else "agent", agent)

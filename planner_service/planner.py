@@ -10,13 +10,10 @@ from typing import Any
 import numpy as np
 
 from planner_service.any_angle_routes import Puller, pulls
-from planner_service.followers import Follower, Followers
-from planner_service.gap_statistics import GapStatistics
+from planner_service.followers import LONGEST_WAIT_NS, Follower, Followers, GapStatistics, MapIntake
 from planner_service.growth_times import MODEL_EXACT_NS_PER_CELL, MODEL_NS_PER_CELL
-from planner_service.kernels.stride_growth import StrideNetwork
-from planner_service.map_intake import LONGEST_WAIT_NS, MapIntake
-from planner_service.search.search_places import Searcher, Ways
-from planner_service.search.search_triggers import TargetSearch, is_place
+from planner_service.kernels.stride_networks import StrideNetwork
+from planner_service.target_search import Searcher, TargetSearch, Ways, is_place
 from planner_service.target_tree import Kind, TargetTree, Update
 from planner_service.tracker_notes import TargetWatch
 from planner_service.tree.partitioned_tree import GrownTree

@@ -15,7 +15,7 @@ from planner_service.goal_tree_cache import GoalTrees
 from planner_service.strategy import STRATEGIES
 from planner_service.target_tree import TargetTree
 from planner_service.tree.cost_grid import CostGrid
-from shared_map.terrain.step_climb import Climb
+from shared_map.terrain.slope_and_climb import Climb
 from swarm.config.explain import choice, converted
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec, Window, walk, whole

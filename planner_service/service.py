@@ -8,12 +8,11 @@ from functools import partial
 
 import msgspec
 
-from planner_service.kernels.stride_growth import StrideNetwork
+from planner_service.kernels.stride_networks import StrideNetwork
 from planner_service.planner import Action, Answer, Planner, Refusal, Work
-from planner_service.planning_process import Planning, PlanningProcess
-from planner_service.prepared_costs import PreparedCosts
-from planner_service.search.search_triggers import TargetSearch, hidden_target
+from planner_service.planning_process import Planning, PlanningProcess, PreparedCosts
 from planner_service.strategy import StrategyWorld, strategy_of
+from planner_service.target_search import TargetSearch, hidden_target
 from planner_service.target_tree import TargetTree
 from planner_service.tracker_notes import TargetWatch
 from planner_service.tree.partitioned_tree import GrownTree
@@ -24,7 +23,7 @@ from swarm.bus.bus import Asked, Event, Heard, LinkChanged, WorkDone
 from swarm.clock import NS_PER_S
 from swarm.config.vehicle_classes import GROUND
 from swarm.peers import job_of
-from swarm.plugins.find import named_plugin
+from swarm.plugins import named_plugin
 from swarm.wire import topics
 from swarm.wire.messages.orders import Obey
 from swarm.wire.messages.planning import (

@@ -15,8 +15,7 @@ from typing import Literal, Protocol
 
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec
-from swarm.plugins.find import Plugin
-from swarm.plugins.guard import Guard, Nonsense, Tell
+from swarm.plugins import Guard, Nonsense, Plugin, Tell
 
 AHEAD = 16
 """A window reaches this multiple of the target's distance since the last one as wide."""

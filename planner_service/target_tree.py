@@ -18,8 +18,8 @@ from numpy.typing import NDArray
 
 from planner_service.growth_times import Askers, GrowthTimes, WindowSchedule, exact_half
 from planner_service.kernels.layout import NONE
-from planner_service.kernels.route_walk import UNREACHABLE
-from planner_service.kernels.stride_growth import StrideNetwork
+from planner_service.kernels.route_kernels import UNREACHABLE
+from planner_service.kernels.stride_networks import StrideNetwork
 from planner_service.strategy import HYSTERESIS, OnMove, Strategy, StrategyRow, whole_trees_only
 from planner_service.tree.cost_changes import Changes
 from planner_service.tree.cost_grid import CostGrid
@@ -38,7 +38,7 @@ from planner_service.tree.partitioned_tree import (
 from planner_service.tree.route_bounds import LowerBounds, read_routes
 from planner_service.tree.strides import find_strides
 from shared_map.array_files import Floats
-from shared_map.terrain.step_climb import Climb
+from shared_map.terrain.slope_and_climb import Climb
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec, Window
 from swarm.wire.route_columns import NO_TARGET, RouteBatch

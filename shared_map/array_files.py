@@ -74,10 +74,10 @@ def reuse_memory() -> None:
     """Keeps the memory of small freed arrays for the next ones. By default the allocator gives much of it back
     after each band; fetching it again took a fifth of the time of classifying a photo. Large ones are given
     back."""
-    set_option = getattr(ctypes.CDLL(None), "mallopt", None)  # glibc's
-    if set_option is not None:
-        set_option(_TRIM_THRESHOLD, 64 << 20)
-        set_option(_MMAP_THRESHOLD, 16 << 20)
+    set_malloc_option = getattr(ctypes.CDLL(None), "mallopt", None)  # glibc's
+    if set_malloc_option is not None:
+        set_malloc_option(_TRIM_THRESHOLD, 64 << 20)
+        set_malloc_option(_MMAP_THRESHOLD, 16 << 20)
 
 
 def give_back_memory() -> None:

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shared_map.array_files import Bytes, Floats, private_copy
-from shared_map.learning.learned_factors import factors_in, keys_of
-from shared_map.learning.measurements import KEYS
+from shared_map.learned_factors import factors_in, keys_of
+from shared_map.pace_measurements import KEYS
 from shared_map.terrain.pace_layers import LETHAL, inflate, inflation_halves
 from shared_map.terrain.terrain import Terrain
 from swarm.errors import OutsideGridError
@@ -225,11 +225,11 @@ def cluster(cells: NDArray[np.int64], cols: int) -> list[Window]:
     if len(tiles) > _MANY_BOXES and np.count_nonzero(np.bincount(tiles)) > _MANY_BOXES:
         # A late join: to look which of thousands touch would take longer than to join.
         return [Window(int(rows.min()), int(columns.min()), int(rows.max()) + 1, int(columns.max()) + 1)]
-    order = np.argsort(tiles, kind="stable")
-    starts = np.flatnonzero(np.diff(tiles[order], prepend=-1))
-    rows, columns = rows[order], columns[order]
-    tops, bottoms = np.minimum.reduceat(rows, starts), np.maximum.reduceat(rows, starts)
-    lefts, rights = np.minimum.reduceat(columns, starts), np.maximum.reduceat(columns, starts)
+    by_tile = np.argsort(tiles, kind="stable")
+    tile_starts = np.flatnonzero(np.diff(tiles[by_tile], prepend=-1))
+    rows, columns = rows[by_tile], columns[by_tile]
+    tops, bottoms = np.minimum.reduceat(rows, tile_starts), np.maximum.reduceat(rows, tile_starts)
+    lefts, rights = np.minimum.reduceat(columns, tile_starts), np.maximum.reduceat(columns, tile_starts)
     boxes = zip(tops.tolist(), lefts.tolist(), bottoms.tolist(), rights.tolist(), strict=True)
     return merged([Window(top, left, bottom + 1, right + 1) for top, left, bottom, right in boxes])
 

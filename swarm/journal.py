@@ -193,7 +193,7 @@ class Journal:
         """Makes the file if there is none, and the spare one if it can. Empties `found`."""
         self.found = []
         if self._file < 0:
-            self._switch()
+            self._switch_to_spare()
         self.reserve()
 
     def reserve(self) -> str | None:
@@ -225,7 +225,7 @@ class Journal:
         """Writes a record that is already among what still counts. It counts after the next `sync`."""
         seal, record = _chained(self._seal, [body])
         if self._at + len(record) > self._size:
-            self._switch()
+            self._switch_to_spare()
             self.reserve()
             return
         with writing(self._path):
@@ -238,7 +238,7 @@ class Journal:
         """Returns once all records are on the disk, and the seal counts them."""
         if not self._synced:
             if self._is_broken:  # the system tells only once of a write that was lost: all is written again
-                self._switch()
+                self._switch_to_spare()
                 self._is_broken = False
                 return
             self._is_broken = True
@@ -291,13 +291,13 @@ class Journal:
         self._synced = False  # a record that is whole counts from now on, and a witness may be missing
         self.sync()
 
-    def _switch(self) -> None:
+    def _switch_to_spare(self) -> None:
         """Goes over to the spare file."""
         if (why := self.reserve()) is not None:
             raise StoreError(why)
-        start = secrets.token_bytes(DIGEST_BYTES)  # remains in the spare file do not follow from it
-        seal, records = _chained(self._seal._replace(first=self._seal.last, digest=start), self._live())
-        content = seal.packed() + start + records
+        first_digest = secrets.token_bytes(DIGEST_BYTES)  # remains in the spare file do not follow from it
+        seal, records = _chained(self._seal._replace(first=self._seal.last, digest=first_digest), self._live())
+        content = seal.packed() + first_digest + records
         with writing(self._path):
             fcntl.flock(self._spare, fcntl.LOCK_EX | fcntl.LOCK_NB)
             _write(self._spare, content, 0)

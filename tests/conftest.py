@@ -13,7 +13,7 @@ import pytest
 from hypothesis import settings
 from support.effort import few, try_all
 
-from swarm.runtime import first_use
+from swarm.runtime import loop_health
 
 TESTS = Path(__file__).parent
 # Processes that a test starts find this checkout and the support modules, whatever their folder.
@@ -39,7 +39,7 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 
 def pytest_configure(config: pytest.Config) -> None:
-    first_use.refused = True
+    loop_health.refused = True
     # No deadline: on a busy machine a test is not to fail for taking long.
     if config.getoption("--thorough"):
         try_all()

@@ -18,7 +18,7 @@ in a planner, 19 and 20 in the agent of the other vehicle:
 9. `replica.py`: `MapReplica.merge` determines the winning marks (`merge.py`).
 10. `shared_map/vehicle_class_grounds.py`: `ClassMaps.apply` passes them to the map of each vehicle class.
 11. `shared_map/cost_map.py`: `CostMap.apply` changes the paces and notes the changed windows.
-12. `planner_service/planner.py`: `Planner.tick` takes the windows (`map_intake.MapIntake` decides when).
+12. `planner_service/planner.py`: `Planner.tick` takes the windows (`followers.MapIntake` decides when).
 13. `planner_service/target_tree.py`: `TargetTree.update` learns the new costs.
 14. `planner_service/tree/cost_to_go.py`: `CostToGoTree.repair` repairs the tree.
 15. `planner_service/followers.py`: `Followers.touch` marks the routes that a change concerns, `due` selects them.

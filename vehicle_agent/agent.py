@@ -11,10 +11,9 @@ from itertools import chain, islice, zip_longest
 import numpy as np
 from numpy.typing import NDArray
 
-from shared_map.terrain.step_climb import may_be_pulled
+from shared_map.terrain.slope_and_climb import may_be_pulled
 from swarm.clock import NS_PER_S
-from swarm.config.agent_plan import AgentPlan
-from swarm.config.scenario import Scenario
+from swarm.config.scenario import AgentPlan, Scenario
 from swarm.grid import Window, walk
 from swarm.right_of_way.holdings import Holdings, Wish
 from swarm.runtime.tracker_ownership import Trackings

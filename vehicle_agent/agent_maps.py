@@ -15,12 +15,12 @@ from numpy.typing import NDArray
 
 from shared_map.array_files import Floats
 from shared_map.cost_map import CostMap, merged
-from shared_map.learning.measurements import Measured, Measurement
+from shared_map.pace_measurements import Measured, Measurement
 from shared_map.replication.marks import NO_STATEMENTS, Statements, dense, is_zone, standing
 from shared_map.replication.merge import winners
 from shared_map.replication.replica import MapReplica
 from shared_map.replication.tiles import grid_cells, tile_corners
-from shared_map.terrain.step_climb import Climb
+from shared_map.terrain.slope_and_climb import Climb
 from shared_map.vehicle_class_grounds import ClassGround, ClassMaps, for_class, read_marks
 from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec, Window

@@ -16,12 +16,12 @@ from shared_map.terrain.terrain import Terrain
 from shared_map.vehicle_class_grounds import class_grounds
 from swarm.bus.bus import Bus, Post
 from swarm.clock import NS_PER_S
-from swarm.config.agent_plan import AgentPlan, plan_agents, readable_groups
 from swarm.config.plugin_names import assignment_key
+from swarm.config.scenario import AgentPlan, plan_agents, readable_groups
 from swarm.config.vehicle_classes import GROUND, class_named, class_numbers, flies, of_class
 from swarm.errors import ConfigError
 from swarm.grid import REGION_CELLS
-from swarm.plugins.find import named_plugin
+from swarm.plugins import named_plugin
 from swarm.right_of_way.agent_core import RightOfWay
 from swarm.right_of_way.agent_session import RightOfWaySync
 from swarm.right_of_way.promise_store import PromiseStore

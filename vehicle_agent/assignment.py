@@ -14,8 +14,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from swarm.plugins.find import Plugin
-from swarm.plugins.guard import Guard, Nonsense, Tell
+from swarm.plugins import Guard, Nonsense, Plugin, Tell
 
 Costs = NDArray[np.float64]
 

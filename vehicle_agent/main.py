@@ -8,7 +8,7 @@ from collections.abc import Callable
 from shared_map.terrain.store import load_terrain, load_truth
 from shared_map.vehicle_class_grounds import load_classes
 from swarm.bus.bus import Bus
-from swarm.recording.role_process import run_role
+from swarm.recording.record_inputs import run_role
 from swarm.recording.service_boundary import Boundary
 from swarm.right_of_way.promise_store import PROMISE_STORE, FilePromiseStore, PromiseStore
 from swarm.runtime.inbox import Inbox

@@ -17,11 +17,11 @@ from numpy.typing import NDArray
 from shared_map.terrain.terrain import Terrain
 from swarm.bus.bus import Appeared, Asked, AskEnded, Bus, Disappeared, Event, Heard, LinkChanged, Post, Replied
 from swarm.clock import NS_PER_S
-from swarm.config.agent_plan import place_job
+from swarm.config.scenario import place_job
 from swarm.peers import Roster, job_of
 from swarm.right_of_way.promise_store import PromiseStore
 from swarm.runtime.membership import MemberService
-from swarm.runtime.order_client import OrderClient
+from swarm.runtime.order_book import OrderClient
 from swarm.runtime.role_setup import RoleSetup
 from swarm.runtime.stats import GAPS_OF, GAPS_TO, UNPROVEN_OF, UNPROVEN_TO
 from swarm.wire import topics

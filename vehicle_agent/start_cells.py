@@ -17,8 +17,7 @@ from shared_map.array_files import CellsOf, private_copy
 from shared_map.terrain.map_frame import MapFrame
 from shared_map.vehicle_class_grounds import ClassGround
 from swarm.clock import NS_PER_S
-from swarm.config.agent_plan import AddedAgent, plan_agents
-from swarm.config.scenario import GroupConfig, Scenario
+from swarm.config.scenario import AddedAgent, GroupConfig, Scenario, plan_agents
 from swarm.errors import ConfigError
 from swarm.grid import GridSpec
 from swarm.places import cell_of, written

@@ -21,7 +21,7 @@ import typer
 from docs.generate import scenario_page, wire_page
 from docs.generate.templates import filled
 from launch_scripts import cli
-from launch_scripts.gateways.ros2 import topic_table
+from launch_scripts.gateways.ros2 import gateway_settings
 from launch_scripts.gateways.ros2.gateway_settings import Settings
 from launch_scripts.typer_commands import Family
 from shared_map.importers.cover.land_cover import TABLES
@@ -82,7 +82,7 @@ def _rows(command: Any) -> list[tuple[str, str, str]]:
 def ros2() -> str:
     """Returns the page of what `swarm gateway ros2` forwards and of its settings."""
     settings = scenario_page.settings(Settings)
-    return filled("ros2", table=topic_table, qos=_QOS, settings=settings)
+    return filled("ros2", table=gateway_settings, qos=_QOS, settings=settings)
 
 
 def design() -> str:

@@ -16,9 +16,9 @@ from typing import NamedTuple
 
 from launch_scripts.check import Finding, Level, failure, warning
 from launch_scripts.deploy.machines_needed import needs_on, swarm_of
-from launch_scripts.observe.run_folder import version_of
+from launch_scripts.observe.run_folders import version_of
 from launch_scripts.process_table import processes_of
-from swarm.config.agent_plan import PLACE_TREES_BYTES, place_trees_bytes, places_of, plan_agents
+from swarm.config import scenario as settings
 from swarm.config.input_files import size
 from swarm.config.scenario import NetworkConfig, Scenario
 from swarm.errors import StoreError, SwarmError
@@ -90,14 +90,14 @@ def this_machine(runs: Path) -> Resources:
 def needs_of(scenario: Scenario, cells: int) -> RunNeeds:
     """Returns the needs of a scenario on a terrain of `cells` cells."""
     vehicles, standbys = scenario.vehicle_count, scenario.standbys.planner
-    agents, processes = len(plan_agents(scenario)), len(processes_of(scenario))
+    agents, processes = len(settings.plan_agents(scenario)), len(processes_of(scenario))
     trees = len(scenario.target_ids) * (1 + standbys)
     memory = (
         processes * _PROCESS_BYTES + vehicles * _VEHICLE_BYTES + cells * (_CELL_BYTES + trees * _TREE_CELL_BYTES)
     )
     classes = 1 + len(scenario.classes)
-    kept = place_trees_bytes(PLACE_TREES_BYTES, classes, cells)
-    memory += len(places_of(scenario)) * classes * (kept + cells * _TREE_CELL_BYTES)
+    kept = settings.place_trees_bytes(settings.PLACE_TREES_BYTES, classes, cells)
+    memory += len(settings.places_of(scenario)) * classes * (kept + cells * _TREE_CELL_BYTES)
     recording = int(min(scenario.seconds / 60 * _RECORDING_BYTES_PER_MINUTE, _MOST_BYTES))
     taken = needs_on(1, swarm_of(scenario, cells), standbys)
     cores, planner_cores = sum(taken.cpu_cores.values()), taken.process["planner"]

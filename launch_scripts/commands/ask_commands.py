@@ -101,7 +101,7 @@ def status(where: shared_options.Where, watch: bool = False, as_json: shared_opt
     watch  Show processes once a second, as `swarm top`.
     """
     from launch_scripts.commands.status_view import ask_status, print_status, status_fields
-    from launch_scripts.launcher.terminal_tables import whole_output
+    from launch_scripts.launcher.console import whole_output
 
     if watch:
         top(where, as_json=as_json)

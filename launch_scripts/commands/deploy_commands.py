@@ -16,12 +16,10 @@ from rich.text import Text
 
 from launch_scripts.commands.shared_options import AsJson, Force, Namespace, ScenarioArgument, Tls
 from launch_scripts.deploy import certificates, machines_needed
-from launch_scripts.deploy.hosts import load_hosts
-from launch_scripts.deploy.kits import CERTIFICATES, keepers_before, write_kits
-from launch_scripts.deploy.machine_plan import Plan, make_plan, plan_fields
-from launch_scripts.deploy.service_files import compose_files, systemd_files, zenohd_config
+from launch_scripts.deploy import machine_archives as archives
+from launch_scripts.deploy.machine_plan import Plan, load_hosts, make_plan, plan_fields
+from launch_scripts.launcher.console import columns
 from launch_scripts.launcher.run_options import common_run_id, find_scenario, own_certificate, with_network
-from launch_scripts.launcher.terminal_tables import columns
 from launch_scripts.plain_text import number_of
 from launch_scripts.process_table import ROLES, admitting_all, certificate_names
 from launch_scripts.report.gis_formats import check_target
@@ -29,9 +27,9 @@ from launch_scripts.typer_commands import command, complete_scenarios, family_ap
 from swarm.bus.zenoh_config import ROUTER, bearer, common_name
 from swarm.config import revocations
 from swarm.config.input_files import quoted
-from swarm.config.load import anchored, check_endpoint
 from swarm.config.scenario import Scenario
 from swarm.config.setting_types import MOST_PER_AGENT, MOST_TARGETS
+from swarm.config.toml_files import anchored, check_endpoint
 from swarm.errors import ConfigError
 from swarm.files import write_file
 
@@ -78,7 +76,7 @@ def plan(
     chosen = with_network(find_scenario(scenario), namespace=namespace)
     try:
         run_id = common_run_id(chosen)
-        keepers = {} if out is None else keepers_before(out, run_id)
+        keepers = {} if out is None else archives.keepers_before(out, run_id)
         made = make_plan(chosen, load_hosts(hosts), run_id, keepers)
     except ConfigError as error:
         sentence = str(error)
@@ -107,9 +105,11 @@ def plan(
 
 def _write(made: Plan, out: Path, kit: KitName, image: str, days: int, wheel: Path | None) -> list[Path]:
     if kit == "systemd":
-        return write_kits(made, out, systemd_files, days, wheel)
-    compose = partial(compose_files, image=image, revoked=revocations.revoked_in(out / CERTIFICATES))
-    return write_kits(made, out, compose, days, launcher=False)
+        return archives.write_kits(made, out, archives.systemd_files, days, wheel)
+    compose = partial(
+        archives.compose_files, image=image, revoked=revocations.revoked_in(out / archives.CERTIFICATES)
+    )
+    return archives.write_kits(made, out, compose, days, launcher=False)
 
 
 def _show(made: Plan, kit: KitName) -> None:
@@ -302,6 +302,6 @@ def zenohd(
     # zenohd may run elsewhere than here.
     network = anchored(msgspec.structs.replace(chosen, network=network), Path.cwd()).network
     folder = None if plugins is None else str(plugins.resolve())
-    config = zenohd_config(revocations.with_revocations(network), folder)
+    config = archives.zenohd_config(revocations.with_revocations(network), folder)
     write_file(out, (json.dumps(config, indent=2) + "\n").encode())
     print(f"{out}: run `zenohd -c {out}`")

@@ -10,12 +10,12 @@ from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
 import typer
 
 from launch_scripts.commands.shared_options import VehicleClass, Where, duration
-from launch_scripts.observe.run_folder import RUNS
+from launch_scripts.observe.run_folders import RUNS
 from launch_scripts.process_table import check_name
 from launch_scripts.stop_requests import stop_requests
 from launch_scripts.typer_commands import command, family_app
 from swarm.bus.endpoints import listening
-from swarm.config.agent_plan import agent_of
+from swarm.config.scenario import agent_of
 from swarm.errors import BusError, ConfigError
 from swarm.places import read_place
 

@@ -16,15 +16,15 @@ from numpy.typing import NDArray
 from rich.console import Console
 
 from launch_scripts.commands.shared_options import AsJson, Force, Where
-from launch_scripts.launcher.terminal_tables import columns
+from launch_scripts.launcher.console import columns
 from launch_scripts.observe.run_observer import ask_learned
 from launch_scripts.plain_text import number_of
 from launch_scripts.report.gis_formats import AREAS, TIFF, check_target, write_layers, write_raster
 from launch_scripts.report.run_gis_layers import mark_layer
 from launch_scripts.typer_commands import command, family_app
 from shared_map.keeper.mark_store import KeeperStore
-from shared_map.learning.learned_factors import learned_kinds, name_of
-from shared_map.learning.measurements import measurements_in
+from shared_map.learned_factors import learned_kinds, name_of
+from shared_map.pace_measurements import measurements_in
 from shared_map.replication.marks import statements
 from shared_map.replication.replica import MapReplica
 from shared_map.replication.tiles import beyond_tile, grid_cells, tile_corners

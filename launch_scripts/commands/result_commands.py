@@ -16,7 +16,7 @@ from rich.text import Text
 
 from launch_scripts.commands.shared_options import AsJson, Force, Runs, duration
 from launch_scripts.launcher.console import REPORTED, progress
-from launch_scripts.observe.run_folder import SCENARIO_FILE, find_run, read_report
+from launch_scripts.observe.run_folders import SCENARIO_FILE, find_run, read_report
 from launch_scripts.plain_text import plain
 from launch_scripts.typer_commands import command, complete_runs, family_app
 from swarm.config.explain import choice

@@ -127,7 +127,7 @@ def run_role(
     from launch_scripts.launcher.log_file import Speaker, log_to
     from launch_scripts.launcher.watcher import check_vacant
     from launch_scripts.process_table import TABLE, check_name, processes_of
-    from swarm.config.agent_plan import added_agent
+    from swarm.config.scenario import added_agent
     from swarm.runtime.role_setup import RoleSetup
 
     log, is_router = logging.getLogger(__name__), role == "router"

@@ -211,8 +211,7 @@ def find_swarm(runs: Path | None = None, name: str | None = None) -> list[tuple[
     name  of the run, or its folder; only that is looked at then
     Raises BusError if no router listens, ConfigError if there is no run of that name.
     """
-    from launch_scripts.observe.local_runs import registered
-    from launch_scripts.observe.run_folder import RUNS, find_run
+    from launch_scripts.observe.run_folders import RUNS, find_run, registered
     from swarm.bus.endpoints import listening
     from swarm.config.scenario import NetworkConfig
 
@@ -241,7 +240,7 @@ def find_swarm(runs: Path | None = None, name: str | None = None) -> list[tuple[
 
 def network_of(folder: Path) -> NetworkConfig | None:
     """The network of a run, from its scenario as it ran; None if it was simulated or that cannot be read."""
-    from launch_scripts.observe.run_folder import SCENARIO_FILE, run_facts
+    from launch_scripts.observe.run_folders import SCENARIO_FILE, run_facts
     from swarm.config.scenario import NetworkConfig
 
     try:

@@ -25,7 +25,7 @@ from swarm.files import writing
 if TYPE_CHECKING:
     from rich.console import Console
 
-    from launch_scripts.simulation.study.sweep import Sweep
+    from launch_scripts.simulation.study_sweep import Sweep
     from launch_scripts.simulation.trials import Result, Trial
 
 app = typer.Typer()
@@ -87,7 +87,7 @@ def _simulate_once(
     from launch_scripts.check.scenario_check import check_places
     from launch_scripts.launcher.console import Terminal, progress
     from launch_scripts.launcher.run_options import find_scenario, make_run_dir, new_run_id
-    from launch_scripts.observe.run_folder import begin_run
+    from launch_scripts.observe.run_folders import begin_run
     from launch_scripts.report.report_and_tracks import with_series, write_report
     from launch_scripts.simulation.sample_worlds import WORLDS
     from launch_scripts.simulation.simulate import Simulation, run_to_end
@@ -223,9 +223,8 @@ def sweep_study(name: str, scheduler: str | None, workers: int | None, out: Path
         )
     from dask.system import CPU_COUNT
 
-    from launch_scripts.simulation.study.study import study_path
-    from launch_scripts.simulation.study.summary import METHOD, outcome_table
-    from launch_scripts.simulation.study.sweep import NUMBERS, RESULTS, Sweep
+    from launch_scripts.simulation.study import METHOD, outcome_table, study_path
+    from launch_scripts.simulation.study_sweep import NUMBERS, RESULTS, Sweep
 
     sweep = Sweep(study_path(name), out)
     console = Console(stderr=True, highlight=False, soft_wrap=True, markup=False, emoji=False)

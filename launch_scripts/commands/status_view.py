@@ -14,11 +14,11 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
-from launch_scripts.launcher.console import Tell, make_output_outlive_readers, progress
-from launch_scripts.launcher.terminal_tables import columns, fitted, loads_table, targets_table, whole_output
-from launch_scripts.observe import fact_table as facts
+from launch_scripts.launcher import console as terminal
+from launch_scripts.launcher.console import Tell, progress
+from launch_scripts.observe import run_state as facts
 from launch_scripts.observe.latest_messages import LatestState
-from launch_scripts.observe.local_runs import pids_of
+from launch_scripts.observe.run_folders import pids_of
 from launch_scripts.observe.run_observer import OutsideObserver, frame_of_members
 from launch_scripts.observe.run_state import RunState, state_of
 from launch_scripts.observe.summed_counts import ProcessLoad, gaps_to
@@ -135,7 +135,7 @@ def print_status(status: Status, console: Console) -> None:
         say(line, "yellow")
     if state.targets:
         for always in (True, False):  # apart, so that the main table fits a terminal
-            console.print(targets_table(state, len(state.targets), always=always))
+            console.print(terminal.targets_table(state, len(state.targets), always=always))
     for id, planner in sorted(status.latest.status.items()):
         cell = _target_cell(planner, frame)
         if frame is not None and cell is not None:
@@ -161,7 +161,7 @@ def _progress(goal: GoalState, frame: MapFrame | None) -> str:
 
 
 def _processes(status: Status) -> Table:
-    crew = columns("process", "pid", "up", "messages out", "in", "dropped")
+    crew = terminal.columns("process", "pid", "up", "messages out", "in", "dropped")
     for info in status.members:
         stats = status.latest.newest_stats(info.role, info.id)
         counts = {} if stats is None else stats.counts
@@ -220,8 +220,8 @@ def _target_cell(planner: PlannerStatus, frame: MapFrame | None) -> int | None:
 
 def show_top(where: Where, *, each: bool, once: bool, as_json: bool) -> None:
     """Shows the swarm until Ctrl-C or its end. Raises BusError if no process replies at the beginning."""
-    make_output_outlive_readers()
-    console = whole_output()
+    terminal.make_output_outlive_readers()
+    console = terminal.whole_output()
     moving = console.is_terminal and not as_json and not once
     with suppress(KeyboardInterrupt), stop_requests(), where.bus() as bus:
         observer, clock = observed(bus, where, _TOP_LISTEN_S), MonotonicClock()
@@ -249,10 +249,10 @@ def show_top(where: Where, *, each: bool, once: bool, as_json: bool) -> None:
 
 def table_of(run: RunInfo, state: RunState, processes: list[ProcessLoad], console: Console, *, each: bool) -> Group:
     """The run at an instant, at most 80 columns wide."""
-    load = loads_table(processes, each=each)
+    load = terminal.loads_table(processes, each=each)
     title = Text(f"run {run.run_id}, scenario {run.scenario}, {facts.fact('elapsed_s').shown(state)}", style="bold")
     alarms = (Text(line, style="red") for line in facts.alarm_lines(state, _SHOWN_ON_TOP))
-    return fitted(state, [title, *map(Text, facts.lines(state)), *alarms, Text(), load], console)
+    return terminal.fitted(state, [title, *map(Text, facts.lines(state)), *alarms, Text(), load], console)
 
 
 def top_fields(run: RunInfo, state: RunState, processes: list[ProcessLoad]) -> dict[str, Any]:

@@ -21,14 +21,13 @@ from launch_scripts.launcher.run_options import find_scenario
 from launch_scripts.report.gis_formats import AREAS, TIFF, check_target, write_raster
 from launch_scripts.typer_commands import command, family_app
 from shared_map.terrain.pace_layers import TerrainClass
-from shared_map.terrain.slope_rules import said_of_cost
+from shared_map.terrain.slope_and_climb import said_of_cost
 from shared_map.terrain.terrain import Terrain, build_terrain
 from shared_map.terrain.terrain_report import facts_of, lines_of, notes_and_doubts
-from swarm.config.cost_rules import cost_of_preset
 from swarm.config.ground import TerrainConfig
 from swarm.config.scenario import Scenario
 from swarm.config.setting_types import ElevationEncoding
-from swarm.config.vehicle_classes import of_class
+from swarm.config.vehicle_classes import cost_of_preset, of_class
 from swarm.errors import ConfigError
 from swarm.grid import GridSpec
 
@@ -363,7 +362,7 @@ def _print_confusion(title: str, counts: NDArray[np.int64]) -> None:
 
 def _draw(terrain: Terrain, path: Path | None, title: str) -> None:
     if path is not None:
-        from launch_scripts.report.terrain_figure import draw_terrain
+        from launch_scripts.report.plots_and_figures import draw_terrain
 
         draw_terrain(terrain, path, title)
 

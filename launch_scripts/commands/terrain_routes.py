@@ -20,7 +20,7 @@ from planner_service.route_finder import RouteFinder
 from shared_map.array_files import Floats
 from shared_map.terrain.map_frame import MapFrame, middles_of
 from shared_map.terrain.pace_layers import TerrainClass
-from shared_map.terrain.slope_rules import said_of_cost
+from shared_map.terrain.slope_and_climb import said_of_cost
 from shared_map.terrain.terrain import Terrain, build_terrain
 from swarm.config.scenario import PlannerConfig, Scenario
 from swarm.errors import ConfigError, TerrainError
@@ -157,7 +157,7 @@ def write_route(route: DescribedRoute, path: Path) -> None:
         raise ConfigError(
             f"--out {path}: a picture needs the terrain; find the route with --terrain, or write .geojson"
         )
-    from launch_scripts.report.terrain_figure import draw_route
+    from launch_scripts.report.plots_and_figures import draw_route
 
     up_m, down_m = route.climb_m or (0.0, 0.0)
     title = f"{route.name}: {said_length(float(f'{route.length_m:.4g}'))} in {route.cost_s:.0f} s"

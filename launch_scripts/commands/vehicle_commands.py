@@ -13,7 +13,7 @@ from launch_scripts.commands.order_commands import give
 from launch_scripts.commands.role_commands import Part, run_role
 from launch_scripts.commands.shared_options import AsJson, Where
 from launch_scripts.typer_commands import command, family_app
-from swarm.config.agent_plan import agent_of
+from swarm.config.scenario import agent_of
 from swarm.errors import BusError, ConfigError
 from swarm.grid import GridSpec
 from swarm.places import read_place

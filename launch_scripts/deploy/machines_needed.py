@@ -25,8 +25,7 @@ import msgspec
 import numpy as np
 
 from launch_scripts.process_table import LAUNCHER
-from swarm.config.agent_plan import plan_agents
-from swarm.config.scenario import Scenario
+from swarm.config.scenario import Scenario, plan_agents
 from swarm.errors import ConfigError
 
 USED_SHARE = 0.6

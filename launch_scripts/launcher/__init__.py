@@ -14,5 +14,5 @@ Guarantees of a launcher:
 - Targets which operators add or remove while the swarm runs start and end planners (`ordered_planners`).
 - An upgrade takes a running part over (`takeover`): successors get ready beside it before it is asked to end.
 
-`up` is the order of all that, from the terrain (`fetched_terrain`) to the report; `console` and `terminal_tables`
+`up` is the order of all that, from the terrain (`fetched_terrain`) to the report; `console`
 show it."""

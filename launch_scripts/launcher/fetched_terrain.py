@@ -19,7 +19,7 @@ from swarm.config.plugin_names import cost_layers_of
 from swarm.config.scenario import Scenario
 from swarm.errors import TerrainError
 from swarm.files import writing
-from swarm.plugins.find import source_of
+from swarm.plugins import source_of
 from swarm.runtime.run_secret import authenticator_of
 from swarm.wire.messages.processes import RunInfo
 

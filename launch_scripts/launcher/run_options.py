@@ -16,17 +16,17 @@ import msgspec
 
 from launch_scripts import process_table
 from launch_scripts.launcher.log_file import LogFormat
-from launch_scripts.observe.run_folder import LAST
+from launch_scripts.observe.run_folders import LAST
 from launch_scripts.ports import free_ports
 from launch_scripts.web import LOOPBACK
 from shared_map.importers.terrain_sources import FILE_KINDS, is_terrain
 from swarm.clock import date_ns
-from swarm.config.cost_rules import cost_of_preset
 from swarm.config.explain import choice, converted, nearest
 from swarm.config.ground import TerrainConfig
 from swarm.config.input_files import FileKind, check_bytes, quoted
-from swarm.config.load import check_endpoint, load_scenario
 from swarm.config.scenario import MonitorConfig, NetworkConfig, Scenario, TlsConfig
+from swarm.config.toml_files import check_endpoint, load_scenario
+from swarm.config.vehicle_classes import cost_of_preset
 from swarm.errors import ConfigError, StoreError
 from swarm.files import make_folder, writing
 from swarm.journal import digest_of

@@ -15,7 +15,7 @@ from collections.abc import Callable, Collection
 from pathlib import Path
 
 from launch_scripts.launcher.local_processes import Running
-from launch_scripts.observe.local_runs import LAUNCHER_LOG, logging_into, open_logs
+from launch_scripts.observe.run_folders import LAUNCHER_LOG, logging_into, open_logs
 from launch_scripts.process_table import ROLES, TABLE
 from swarm.errors import ConfigError
 from swarm.peers import job_of

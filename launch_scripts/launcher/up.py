@@ -15,21 +15,18 @@ from typing import Any
 from launch_scripts.check.machine_check import this_machine, why_no_room
 from launch_scripts.check.scenario_check import check_places, check_start
 from launch_scripts.launcher import run_options
-from launch_scripts.launcher.console import Terminal, tunnel, what_is_left
+from launch_scripts.launcher.console import Terminal, live_table, plain_line, tunnel, what_is_left
 from launch_scripts.launcher.fetched_terrain import fetch_if_missing, find_members, missing_files
 from launch_scripts.launcher.forkserver import ROLES_AND_KERNELS, ROLES_ONLY, WarmUp
-from launch_scripts.launcher.launcher_health import LauncherHealth
 from launch_scripts.launcher.local_processes import Ending, LocalSwarm
 from launch_scripts.launcher.log_file import JsonLines, Speaker, log_to
 from launch_scripts.launcher.ordered_planners import OrderedPlanners, with_target
 from launch_scripts.launcher.takeover import TakeOver
-from launch_scripts.launcher.terminal_tables import live_table, plain_line
-from launch_scripts.launcher.watcher import OwnPart, Watcher, check_vacant
-from launch_scripts.observe import fact_table as facts
+from launch_scripts.launcher.watcher import LauncherHealth, OwnPart, Watcher, check_vacant
+from launch_scripts.observe import run_state as facts
 from launch_scripts.observe.latest_messages import plan_of_members
-from launch_scripts.observe.local_runs import LAUNCHER_LOG, register
 from launch_scripts.observe.recorder import Recorder
-from launch_scripts.observe.run_folder import REPORT_FILE, DiskWatch, begin_run
+from launch_scripts.observe.run_folders import LAUNCHER_LOG, REPORT_FILE, DiskWatch, begin_run, register
 from launch_scripts.observe.run_observer import ask_run
 from launch_scripts.plain_text import number_of
 from launch_scripts.ports import check_ports, page_of
@@ -49,7 +46,7 @@ from swarm.clock import MonotonicClock, date_ns
 from swarm.config.scenario import UNTIL_STOPPED_S
 from swarm.errors import BusError, StoreError, SwarmError
 from swarm.peers import Peer, job_of
-from swarm.plugins.find import check_plugins
+from swarm.plugins import check_plugins
 from swarm.runtime.membership import check_belongs
 from swarm.runtime.role_setup import RoleSetup
 from swarm.runtime.run_secret import authenticator_of

@@ -1,28 +1,41 @@
-"""A launcher's view of the swarm: all of it if it records the run, else its own processes."""
+"""A launcher's view of the swarm: all of it if it records the run, else its own processes.
+
+It serves their metrics and health by HTTP, if it is given a port, and tells its state to its supervisor.
+"""
 
 from __future__ import annotations
 
+import os
 import time
-from collections.abc import Collection
+from collections.abc import Callable, Collection, Sequence
+from contextlib import suppress
+from typing import TYPE_CHECKING
 
-from launch_scripts.launcher.terminal_tables import SHOWN_ALARMS
+from launch_scripts.launcher.console import SHOWN_ALARMS
+from launch_scripts.launcher.run_options import UpOptions
 from launch_scripts.observe.alarms import alarms_of
-from launch_scripts.observe.fact_table import lines_of
 from launch_scripts.observe.latest_messages import LatestState, RunPlan
 from launch_scripts.observe.recorder import Recorder
 from launch_scripts.observe.run_observer import HEARD, RECORDED, RunObserver
+from launch_scripts.observe.run_state import lines_of
 from launch_scripts.process_table import TABLE, ProcessSpec
+from launch_scripts.web.health_pages import Process
 from swarm.bus.bus import Bus, Disappeared, Event, Heard
 from swarm.clock import Clock
-from swarm.errors import RunMismatchError
+from swarm.errors import BusError, RunMismatchError
 from swarm.grid import GridSpec
 from swarm.peers import Peer, job_of
 from swarm.runtime.inbox import Inbox
+from swarm.runtime.loop_health import Health, supervisor_of
 from swarm.runtime.stats import VIEWERS
 from swarm.wire.messages.planning import PlannerStatus
 from swarm.wire.messages.processes import Note, RunInfo, Stats
 from swarm.wire.messages.vehicles import Followed
 from swarm.wire.topics import FOLLOWED, NOTE, ORDERS, STATS, STATUS
+
+if TYPE_CHECKING:
+    from launch_scripts.observe.latest_messages import LatestState
+    from launch_scripts.web.prometheus import MetricsEndpoint
 
 _OF_PART = {ORDERS: HEARD[ORDERS], FOLLOWED: 0.0, STATUS: 0.0}
 """Topics of all processes that a launcher receives if another one records the run; FOLLOWED only until a route is
@@ -175,3 +188,71 @@ def check_vacant(found: list[RunInfo], role: str, id: str) -> None:
     for info in found:
         if (info.role, info.id) == (role, id):
             raise RunMismatchError(f"{role} {id} takes part in run {info.run_id} already; stop it first")
+
+
+_TURNS_HZ = 2.0
+"""Lowest rate of a launcher's turns."""
+_NAME = "launcher"
+
+
+class LauncherHealth:
+    """Metrics and health of this launcher's processes, by HTTP. Raises BusError if the port is taken; if another
+    launcher is taken over from, the port is opened once that one has left it.
+
+    seen  state of the processes that this launcher has started; called by any thread
+    """
+
+    def __init__(self, options: UpOptions, run_id: str, seen: Callable[[], Sequence[Process]]) -> None:
+        self._options, self._run_id, self._seen = options, run_id, seen
+        self._health = Health(supervisor=supervisor_of(os.environ))
+        self._health.starts("the start of its processes")
+        self._health.begins(_TURNS_HZ)
+        self._metrics: MetricsEndpoint | None = None
+        if not options.takes_over:
+            self._open()
+
+    @property
+    def url(self) -> str:
+        """URL of the metrics; empty without a port, and before it is opened."""
+        return "" if self._metrics is None else self._metrics.url
+
+    def _open(self) -> None:
+        port, address = self._options.metrics_port, self._options.signals_address
+        if port is None or self._metrics is not None:
+            return
+        from launch_scripts.web.prometheus import MetricsEndpoint  # takes time to import
+
+        board, seen = self._health.board, self._seen
+        self._metrics = MetricsEndpoint(port, lambda: [Process(_NAME, board.read()), *seen()], address)
+
+    def turned(
+        self,
+        observed: LatestState,
+        started_ns: int,
+        missing: Sequence[str],
+        up: Collection[tuple[str, str]] | None = None,
+    ) -> None:
+        """Notes a turn of the launcher, and answers scrapes that came since the last one.
+
+        missing  names of processes that it has started and that no process has seen alive yet
+        up       (role, id) of the living processes, if these are a part of the run; None: the whole run is
+                 observed, so the metrics name it
+        """
+        self._health.turned([f"word of {name}" for name in missing])
+        with suppress(BusError):  # the launcher before still has the port
+            self._open()
+        if self._metrics is not None:
+            from launch_scripts.web.prometheus import Run, families
+
+            run = Run(self._run_id, self._options.scenario.name, started_ns) if up is None else None
+            alive = observed.up() if up is None else up
+            status = observed.status if up is None else {}  # a part hears it until a route is served
+            self._metrics.answer(lambda: families(run, observed, status, alive))
+
+    def ends(self) -> None:
+        """The run ends from now on; figures are answered no more."""
+        self._health.ends()
+
+    def close(self) -> None:
+        if self._metrics is not None:
+            self._metrics.close()

@@ -23,8 +23,7 @@ from launch_scripts.observe import palette
 from launch_scripts.observe.palette import hillshade, rgb
 from shared_map.array_files import Bools
 from shared_map.terrain.pace_layers import TerrainClass
-from shared_map.terrain.pyramid import any_in_blocks
-from shared_map.terrain.terrain import Terrain
+from shared_map.terrain.terrain import Terrain, any_in_blocks
 from swarm.grid import GridSpec, Window
 from swarm.wire.fields import column
 from swarm.wire.messages.planning import CostReply, CostRequest

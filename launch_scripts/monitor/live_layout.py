@@ -21,8 +21,8 @@ from launch_scripts.monitor import ground_colours as colours
 from launch_scripts.monitor.rerun_outputs import Colour, Pen, in_markdown, screen, shown
 from launch_scripts.monitor.styles import FOLLOWED_ENTITY, HINT, HUES, Level, Look, level_for
 from launch_scripts.monitor.terrain_mesh import TerrainMesh
-from launch_scripts.observe import fact_table as facts
 from launch_scripts.observe import palette
+from launch_scripts.observe import run_state as facts
 from launch_scripts.observe.alarms import KINDS
 from launch_scripts.observe.run_state import RunState
 from swarm.config.scenario import Scenario

@@ -18,7 +18,7 @@ from launch_scripts.monitor.ground_view import GroundView, Scene, scenario_areas
 from launch_scripts.monitor.movers_view import MoversView
 from launch_scripts.monitor.rerun_outputs import Pen, RateLimit, Sinks, new_recording_path
 from launch_scripts.monitor.terrain_mesh import TerrainMesh
-from launch_scripts.observe import fact_table as facts
+from launch_scripts.observe import run_state as facts
 from launch_scripts.observe.latest_messages import LatestState, plan_of
 from launch_scripts.observe.run_observer import HEARD, ROUTES_S, RunObserver
 from launch_scripts.observe.run_state import state_of

@@ -15,8 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import map_coordinates
 
-from shared_map.terrain.pyramid import level_of
-from shared_map.terrain.terrain import Terrain
+from shared_map.terrain.terrain import Terrain, level_of
 from swarm.grid import Window
 
 Floats = NDArray[np.float32]

@@ -8,13 +8,12 @@
 | run_observer.py    | `RunObserver` hears the bus for those who know the run; `OutsideObserver` for commands   |
 | latest_messages.py | `LatestState`: newest message of every sender; `RunPlan`: what the run should be         |
 | summed_counts.py   | `Counts`: sums of all processes, with the certified gap, and the load of each            |
-| run_state.py       | `RunState`: the run at an instant; `state_of` makes one                                  |
-| fact_table.py      | `FACTS`, `TARGET_FACTS`: name, label, unit and text of each fact                         |
+| run_state.py       | `RunState`: the run at an instant; `state_of` makes one; `FACTS`, `TARGET_FACTS`: name,  |
+|                    | label, unit and text of each fact                                                        |
 | alarms.py          | `Alarm`, `KINDS`: what went wrong, where, since when, and whether it is over             |
 | recorder.py        | `Recorder`: figures, tracks, routes, captures, notes over time, in bounded memory; it    |
 |                    | makes the numbers of the report, and results per target, group and vehicle               |
-| run_folder.py      | the folder of a run, and how files are written whole                                     |
-| local_runs.py      | the runs of this user on this machine, each by a small file                              |
+| run_folders.py     | the folder of a run; the runs of this user on this machine, each by a small file         |
 | palette.py         | how pictures and the live view look                                                      |
 
 A new fact is a field of `RunState` and a row in `FACTS`, which every report has; `LINES` and `IF_ANY` place it in

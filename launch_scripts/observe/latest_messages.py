@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 from launch_scripts.observe.summed_counts import Counts, sum_of
 from shared_map.replication.merge import winners
 from swarm.clock import NS_PER_S
-from swarm.config.agent_plan import agent_of, crew_of
-from swarm.config.scenario import Scenario
+from swarm.config.scenario import Scenario, agent_of, crew_of
 from swarm.grid import TILE_CELLS, GridSpec
 from swarm.peers import FOR_GOOD_NS, HIGHEST_RANK, Newest, Peer, ranked_id, split_rank
 from swarm.runtime.order_book import OrderBook
@@ -143,23 +142,23 @@ class VehicleColumns:
 def gathered(fleets: Iterable[Fleet]) -> VehicleColumns:
     """All vehicles of these messages. One that is in several, as when it crosses into another region, is where the
     newest puts it."""
-    told = sorted(fleets, key=lambda fleet: (fleet.stamp_ns, fleet.seq))
-    target_ids = sorted({target for fleet in told for target in fleet.target_ids})
-    last = {id: n for n, id in enumerate(id for fleet in told for id in fleet.ids)}
-    ids = sorted(last)
-    rows = np.fromiter((last[id] for id in ids), np.intp, len(ids))
-    place = {target: n for n, target in enumerate(target_ids)}
-    targets = np.full((len(told), NO_TARGET + 1), -1, np.int64)
-    for n, fleet in enumerate(told):
-        targets[n, : len(fleet.target_ids)] = [place[target] for target in fleet.target_ids]
-    of = np.repeat(np.arange(len(told)), [len(fleet.ids) for fleet in told])
-    chased = np.frombuffer(b"".join(fleet.targets for fleet in told), np.uint8)
+    by_age = sorted(fleets, key=lambda fleet: (fleet.stamp_ns, fleet.seq))
+    target_ids = sorted({target for fleet in by_age for target in fleet.target_ids})
+    newest_row = {id: n for n, id in enumerate(id for fleet in by_age for id in fleet.ids)}
+    ids = sorted(newest_row)
+    rows = np.fromiter((newest_row[id] for id in ids), np.intp, len(ids))
+    target_number = {target: n for n, target in enumerate(target_ids)}
+    targets = np.full((len(by_age), NO_TARGET + 1), -1, np.int64)
+    for n, fleet in enumerate(by_age):
+        targets[n, : len(fleet.target_ids)] = [target_number[target] for target in fleet.target_ids]
+    fleet_of_row = np.repeat(np.arange(len(by_age)), [len(fleet.ids) for fleet in by_age])
+    chased = np.frombuffer(b"".join(fleet.targets for fleet in by_age), np.uint8)
     return VehicleColumns(
         ids,
-        np.frombuffer(b"".join(fleet.east_m for fleet in told), "<f4")[rows],
-        np.frombuffer(b"".join(fleet.south_m for fleet in told), "<f4")[rows],
-        np.frombuffer(b"".join(fleet.states for fleet in told), np.uint8)[rows],
-        targets[of, chased][rows],
+        np.frombuffer(b"".join(fleet.east_m for fleet in by_age), "<f4")[rows],
+        np.frombuffer(b"".join(fleet.south_m for fleet in by_age), "<f4")[rows],
+        np.frombuffer(b"".join(fleet.states for fleet in by_age), np.uint8)[rows],
+        targets[fleet_of_row, chased][rows],
         target_ids,
     )
 

@@ -10,8 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from shared_map.terrain.pyramid import Level, level_of
-from shared_map.terrain.terrain import Terrain
+from shared_map.terrain.terrain import Level, Terrain, level_of
 from swarm.wire.messages.vehicles import VehicleState
 
 # Okabe and Ito's colours: safe for colour-blind readers, and of different lightness.

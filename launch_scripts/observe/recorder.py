@@ -17,14 +17,12 @@ from typing import Any, Generic, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from launch_scripts.observe.fact_table import for_report, verdict
 from launch_scripts.observe.latest_messages import LatestState, VehicleColumns, plan_of
 from launch_scripts.observe.run_observer import TRACK_S
-from launch_scripts.observe.run_state import RunState, state_of
+from launch_scripts.observe.run_state import RunState, for_report, state_of, verdict
 from launch_scripts.observe.summed_counts import CertifiedGap, gap_of, gaps_of, gaps_to, of_excess
 from swarm.clock import NS_PER_S
-from swarm.config.agent_plan import agent_of, plan_agents
-from swarm.config.scenario import Scenario
+from swarm.config.scenario import Scenario, agent_of, plan_agents
 from swarm.config.vehicle_classes import GROUND, flies
 from swarm.grid import GridSpec
 from swarm.peers import Peer
@@ -161,19 +159,19 @@ class Driven:
         self._place_m = np.zeros((0, 2))
         """Last position of each; NaN before."""
         self._rows: dict[str, int] = {}
-        self._seen: list[str] = []
-        self._seen_rows: NDArray[np.intp] = np.zeros(0, np.intp)
+        self._newest_vehicles: list[str] = []
+        self._newest_rows: NDArray[np.intp] = np.zeros(0, np.intp)
         """The rows of the vehicles of the last sample; -1 of those beyond the bound."""
         self.at_ns: int | None = None
         """Time of the last sample."""
 
     def add(self, now_ns: int, vehicles: VehicleColumns, groups: Callable[[], Mapping[str, str]]) -> None:
         """Takes in one sample of all vehicles."""
-        if vehicles.ids != self._seen:
-            self._seen = vehicles.ids
+        if vehicles.ids != self._newest_vehicles:
+            self._newest_vehicles = vehicles.ids
             self._know(vehicles.ids, groups())
-        some = np.flatnonzero(self._seen_rows >= 0)
-        rows, states = self._seen_rows[some], vehicles.states[some]
+        some = np.flatnonzero(self._newest_rows >= 0)
+        rows, states = self._newest_rows[some], vehicles.states[some]
         place_m = np.stack([vehicles.east_m[some], vehicles.south_m[some]], axis=1).astype(np.float64)
         moved_m = np.hypot(*(place_m - self._place_m[rows]).T)  # NaN of those that are new
         passed_s = 0.0 if self.at_ns is None else max(now_ns - self.at_ns, 0) / NS_PER_S
@@ -192,7 +190,7 @@ class Driven:
         more = len(self.ids) - len(self._place_m)
         self.totals = np.pad(self.totals, ((0, 0), (0, more)))
         self._place_m = np.pad(self._place_m, ((0, more), (0, 0)), constant_values=np.nan)
-        self._seen_rows = np.array([self._rows.get(id, -1) for id in ids], np.intp)
+        self._newest_rows = np.array([self._rows.get(id, -1) for id in ids], np.intp)
 
 
 def results(latest: LatestState, driven: Driven, scenario: Scenario) -> dict[str, Any]:

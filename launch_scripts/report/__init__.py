@@ -8,8 +8,8 @@ Commands and the ends of runs and studies write it; nothing else imports it. Mat
 |                      | all files below, down to report.html                                                    |
 | run_page_and_map.py  | report.html, one file: figures, map, plots, tables (templates/); report.png; the map of |
 |                      | both: ground, tracks, marks, captures                                                   |
-| plots_and_cards.py   | plots of a run over time and as distributions, its main figures                         |
-| terrain_figure.py    | figures of a terrain, of a route on it                                                  |
+| plots_and_figures.py | plots of a run over time and as distributions, its main figures; figures of a terrain,  |
+|                      | of a route on it                                                                        |
 | compare.py           | what differs between runs                                                               |
 | gis_formats.py       | geometries and rasters as GeoJSON, GeoPackage, KML, GPX, CSV, GeoTIFF; missions         |
 | run_gis_layers.py    | tracks, captures, routes and marks of a run as such geometries; `swarm runs export`     |

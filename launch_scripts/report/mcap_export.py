@@ -40,7 +40,7 @@ from launch_scripts.gateways.ros2.ros_messages import (
 from launch_scripts.gateways.ros2.ros_types import RosTypes, types_of
 from launch_scripts.observe.alarms import Alarm
 from launch_scripts.observe.palette import GROUPS, colours_of_groups, rgb
-from launch_scripts.observe.run_folder import REPORT_FILE, read_report
+from launch_scripts.observe.run_folders import REPORT_FILE, read_report
 from launch_scripts.report.gis_formats import turns_of
 from launch_scripts.report.report_and_tracks import GROUND_PACE_FILE, GroundPace, RunTracks, Track, read_ground
 from launch_scripts.report.run_gis_layers import free_places, groups_of, tracks_of_run

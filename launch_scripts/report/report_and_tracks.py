@@ -27,10 +27,9 @@ from numpy.typing import NDArray
 from launch_scripts.observe.latest_messages import MarkedCells
 from launch_scripts.observe.palette import image_bytes
 from launch_scripts.observe.recorder import Recorder
-from launch_scripts.observe.run_folder import REPORT_FILE, ended
-from shared_map.learning.learned_factors import factors_in, learned_kinds
-from shared_map.terrain.pyramid import Level
-from shared_map.terrain.terrain import Terrain
+from launch_scripts.observe.run_folders import REPORT_FILE, ended
+from shared_map.learned_factors import factors_in, learned_kinds
+from shared_map.terrain.terrain import Level, Terrain
 from shared_map.terrain.terrain_report import bounds_deg
 from swarm.clock import NS_PER_S
 from swarm.config.input_files import FileKind, read_bytes

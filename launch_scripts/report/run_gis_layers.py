@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from launch_scripts.observe.run_folder import REPORT_FILE, lacks, read_report
+from launch_scripts.observe.run_folders import REPORT_FILE, lacks, read_report
 from launch_scripts.report import gis_formats as gis
 from launch_scripts.report.gis_formats import Feature, Layer
 from launch_scripts.report.report_and_tracks import TRACKS_FILE, RunTracks, Track, read_tracks

@@ -33,18 +33,17 @@ from scipy.ndimage import binary_erosion
 
 from launch_scripts.observe import palette
 from launch_scripts.observe.alarms import Alarm
-from launch_scripts.observe.fact_table import WELL, count, grouped, left_behind
 from launch_scripts.observe.palette import colours_of_groups, rgb, round_length, said_length
-from launch_scripts.observe.run_folder import REPORT_FILE, SCENARIO_FILE, read_report
+from launch_scripts.observe.run_folders import REPORT_FILE, SCENARIO_FILE, read_report
+from launch_scripts.observe.run_state import WELL, count, grouped, left_behind
 from launch_scripts.observe.summed_counts import percent
 from launch_scripts.plain_text import first_of
-from launch_scripts.report.plots_and_cards import PLOTS, STYLE, cards, draw_plot, halo, headline, saved
+from launch_scripts.report.plots_and_figures import PLOTS, STYLE, cards, draw_plot, halo, headline, saved
 from launch_scripts.report.report_and_tracks import TABLES, TRACKS_FILE, RunTracks, Track, flat, read_tracks
 from launch_scripts.report.run_gis_layers import groups_of
 from shared_map.array_files import Bools, Bytes, Floats
-from shared_map.learning.learned_factors import keys_of
-from shared_map.terrain.pyramid import Level, any_in_blocks, level_of
-from shared_map.terrain.terrain import Terrain
+from shared_map.learned_factors import keys_of
+from shared_map.terrain.terrain import Level, Terrain, any_in_blocks, level_of
 from shared_map.terrain.zones import zone_mask
 from swarm.clock import NS_PER_S
 from swarm.config.input_files import FileKind, read_bytes, read_text

@@ -14,8 +14,7 @@ import msgspec
 
 from launch_scripts.process_table import SIMULATED_ROLES, processes_of
 from swarm.clock import NS_PER_S
-from swarm.config.agent_plan import plan_agents
-from swarm.config.scenario import Scenario
+from swarm.config.scenario import Scenario, plan_agents
 from swarm.config.vehicle_classes import flies
 from swarm.right_of_way.shards import FEWEST_FOR_MAJORITY
 

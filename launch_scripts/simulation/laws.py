@@ -25,15 +25,14 @@ import msgspec
 import numpy as np
 
 from launch_scripts.simulation.faults import OBSERVER
-from launch_scripts.simulation.simulate import Simulation
-from launch_scripts.simulation.simulated_process import Node
+from launch_scripts.simulation.simulate import Node, Simulation
 from launch_scripts.simulation.world.walks import TrueTerrain
-from planner_service.search.search_triggers import LISTEN_NS
+from planner_service.target_search import LISTEN_NS
 from shared_map.replication.replica import MapReplica
 from shared_map.vehicle_class_grounds import class_grounds
 from swarm.bus.bus import Event, Heard
 from swarm.clock import NS_PER_S
-from swarm.config.agent_plan import plan_agents
+from swarm.config.scenario import plan_agents
 from swarm.config.vehicle_classes import flies
 from swarm.errors import ProtocolError
 from swarm.wire.codec import decode

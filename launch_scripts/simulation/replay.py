@@ -12,14 +12,14 @@ from typing import Any, NamedTuple
 import msgspec
 
 from launch_scripts.process_table import SIMULATED_ROLES
-from launch_scripts.simulation.simulated_process import built
-from planner_service.prepared_costs import PreparedCosts
+from launch_scripts.simulation.simulate import built
+from planner_service.planning_process import PreparedCosts
 from shared_map.array_files import Floats
 from shared_map.terrain.store import load_terrain, load_truth
 from shared_map.terrain.terrain import Terrain
 from shared_map.vehicle_class_grounds import load_classes
-from swarm.config.load import parse_scenario
 from swarm.config.scenario import Scenario
+from swarm.config.toml_files import parse_scenario
 from swarm.errors import ConfigError, StoreError, SwarmError, TerrainError
 from swarm.recording.record_inputs import versions
 from swarm.recording.recording_file import FOLDER, SUFFIX, Head, RecordReader

@@ -2,8 +2,7 @@
 
 `layout` says what the arrays are, `decorators` how kernels are compiled and kept, `climbs` what a step's
 rise does to its cost. Trees are grown by the queues, made exact again by `repair`, `costs_from_parents` and
-`partition*`, thinned out far from their root by `stride_*`, and read by `route_walk`, `pull_routes` and
-`lower_bounds`.
+`tile_*`, thinned out far from their root by `stride_networks`, and read by `route_kernels` and `lower_bounds`.
 
 Cells leave a queue in the order of their costs. There is one for each kind of search, as one for all would take 2.5
 to 3 times as long (docs/design/bucket-queues.md, on two shared cores):
@@ -15,8 +14,8 @@ queue                 of                                                        
 `queue_wide_buckets`  growths over cell costs of any ratio                      any width is exact: the map decides
 `queue_directed`      growths where uphill is not downhill                      a first offer is not the least there
 `repair.spread`       changes of a tree                                         memory follows the changed cells
-`queue_heap`          strides, tiles of a partition: few cells, served by cost  a key may fall below what was served
+`heap_and_buckets`    strides, tiles of a partition: few cells, served by cost  a key may fall below what was served
 ====================  ========================================================  ====================================
 
-The first three keep their buckets in `bucket_chunks`.
+The first three keep their buckets in `heap_and_buckets`.
 """

@@ -155,34 +155,35 @@ def _leads_on(grid, climbs, labels, v, k):
 
 
 @step_kernel(f"({GRID}, CLIMBS, {LABELS}, u4[::1])", CLIMBS)
-def untie_parents(grid, climbs, labels, queue):
+def untie_parents(grid, climbs, labels, parentless):
     """Replaces parents that cost as much as their cells, for exact costs and parents that follow from them.
 
-    queue  uint32 (2 * size,), scratch: padded cells that need another parent; behind them, those that have got one
+    parentless  uint32 (2 * size,), scratch: padded cells that need another parent; behind them, those that have
+                got one
     """
     offsets = grid[1]
     cost, parent, root = labels
     count = 0
     for v in range(cost.size):
         if cost[v] < INF and parent[v] != NONE and not cost[v + offsets[parent[v]]] < cost[v]:
-            queue[count] = v
+            parentless[count] = v
             count += 1
     for i in range(count):
-        parent[queue[i]] = NONE
+        parent[parentless[i]] = NONE
     done = count
     for i in range(count):
-        v = np.int64(queue[i])
+        v = np.int64(parentless[i])
         for k in range(8):
             if parent[v] == NONE and _leads_on(grid, climbs, labels, v, k):
                 parent[v] = k
-                queue[done] = v
+                parentless[done] = v
                 done += 1
     while count < done:
-        u = np.int64(queue[count])
+        u = np.int64(parentless[count])
         count += 1
         for k in range(8):
             v = u - offsets[k]
             if parent[v] == NONE and v != root and cost[v] < INF and _leads_on(grid, climbs, labels, v, k):
                 parent[v] = k
-                queue[done] = v
+                parentless[done] = v
                 done += 1

@@ -11,7 +11,7 @@ cell costs less than the next bucket begins with. Between two calls the cost of 
 Arrays, beside those of `layout`:
     touched  uint32  (size + 1,)     padded cells that have a cost, in the order of the buckets they got it from
     batch    uint32  (size + AHEAD,) padded cells of the bucket that is being served
-    queue    as of `bucket_chunks`; `make_scratch` says how large
+    queue    as of `heap_and_buckets`; `make_scratch` says how large
     state    int64   (4,)            the last bucket served; entries that wait in the queue; how many of `touched`
                                      were put into it; how many there are. `begin` writes it, growths change it
 
@@ -29,8 +29,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from planner_service.kernels.bucket_chunks import QUEUE, Queue, empty, make_queue, put, take
 from planner_service.kernels.decorators import helper, kernel, prefetch
+from planner_service.kernels.heap_and_buckets import QUEUE, Queue, empty, make_queue, put, take
 from planner_service.kernels.layout import (
     BOX,
     BUCKETS,
@@ -279,7 +279,7 @@ def grow_whole(grid: PaddedGrid, cost: Floats, root: int, buckets: Buckets, scra
 
 @kernel(f"({GRID}, f4[::1], {BUCKETS}, {_SCRATCH}, i8[::1], {BOX}, f4[:, ::1], i8)")
 def resume(grid, cost, buckets, scratch, state, box, crop, first):
-    """Goes back to a tree that was cut out (see `cut_trees`): to its costs in buckets below `first`, which are
+    """Goes back to a tree that was cut out (see `route_kernels`): to its costs in buckets below `first`, which are
     exact on the map as it is. Costlier cells are left to `grow_by_buckets`. `cost` is inf and WALL."""
     cell_cost, _, stride, rule, _ = grid
     width, circle = buckets

@@ -21,7 +21,7 @@ Arrays, beside those of `layout` and `climbs`:
     steps    float32, int32 (8 * _PIECE + 8,)  of the steps into a piece's cells, a row for each direction: rise, m;
                                                entry of `prices`
     waiting  uint64  (_LEVELS,)  how many entries wait at each level
-    queue    as of `bucket_chunks`; bucket `digit` of a level is the one numbered _BASE * level + digit
+    queue    as of `heap_and_buckets`; bucket `digit` of a level is the one numbered _BASE * level + digit
 
 While growing, the cost of a cell that was served is negative, so that no offer lowers it, and WALL on lethal cells.
 """
@@ -31,9 +31,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from planner_service.kernels.bucket_chunks import QUEUE, Queue, empty, make_queue, put, take
 from planner_service.kernels.climbs import CLIMBS, find_entries, is_windy
 from planner_service.kernels.decorators import helper, kernel, prefetch
+from planner_service.kernels.heap_and_buckets import QUEUE, Queue, empty, make_queue, put, take
 from planner_service.kernels.layout import GRID, INF, RULE_FOUR, WALL
 
 _ONE = np.uint64(1)
@@ -189,7 +189,7 @@ def _bucket(at, now, level):
 
 
 @helper
-def _choose(cost, inverse, served, level, cells, count, waiting, buckets):
+def _choose_buckets(cost, inverse, served, level, cells, count, waiting, buckets):
     """buckets := where each cell is to wait: at `level` or above."""
     if level > _ZERO or served >= _SURE:
         shift = level * _DIGIT
@@ -250,10 +250,10 @@ def _put_back(cost, inverse, served, level, batch, n, least, scratch):
         count += np.uint64(late)
         kept += np.uint64(not late)
         if count == room:
-            _choose(cost, inverse, served, level, touched, count, waiting, chosen)
+            _choose_buckets(cost, inverse, served, level, touched, count, waiting, chosen)
             put(queue, touched, count, chosen, _MASK, _ZERO)
             count = _ZERO
-    _choose(cost, inverse, served, level, touched, count, waiting, chosen)
+    _choose_buckets(cost, inverse, served, level, touched, count, waiting, chosen)
     put(queue, touched, count, chosen, _MASK, _ZERO)
     return kept
 
@@ -269,7 +269,7 @@ def _serve(grid, cost, climbs, inverse, served, level, n, scratch):
     while first < n:
         some = min(_PIECE, n - first)
         count = _offer(cell_cost, cost, climbs, s, rule == RULE_FOUR, corners, batch, first, some, steps, touched)
-        _choose(cost, inverse, served, level, touched, count, waiting, chosen)
+        _choose_buckets(cost, inverse, served, level, touched, count, waiting, chosen)
         put(queue, touched, count, chosen, _MASK, _ZERO)
         first += some
 

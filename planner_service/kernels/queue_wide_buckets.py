@@ -16,7 +16,7 @@ Arrays, beside those of `layout`:
     touched         uint32  (size + AHEAD,)  padded cells that got their cost from the last bucket
     batch, slanted  uint32  (size + AHEAD,)  those of the bucket that is served, by straight and by diagonal steps
     places          uint32  (size + AHEAD,)  where in the queue cells go; a ring of those to serve again
-    queue           as in `bucket_chunks`; for each kind of step `CIRCLE` buckets and one for the keys behind them
+    queue           as in `heap_and_buckets`; for each kind of step `CIRCLE` buckets and one for keys behind them
 
 While a bucket is served, the cost of a cell that waits to be served again is negative, and WALL on lethal cells.
 """
@@ -26,8 +26,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from planner_service.kernels.bucket_chunks import QUEUE, Queue, empty, make_queue, put, take
 from planner_service.kernels.decorators import helper, kernel
+from planner_service.kernels.heap_and_buckets import QUEUE, Queue, empty, make_queue, put, take
 from planner_service.kernels.layout import GRID, INF, RULE_OCTILE, RULE_PAPER, SQRT2, WALL, diagonal_length
 from planner_service.kernels.queue_dial import (
     AHEAD,

@@ -12,12 +12,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from planner_service.kernels import cell_costs as kernels
-from planner_service.kernels import layout, repair, route_walk
+from planner_service.kernels import layout, repair, route_kernels
 from planner_service.kernels.climbs import Climbs, row_scratch, with_scratch
 from planner_service.tree.cost_changes import NO_CHANGES, Cells, Changes, CostRange, Rounding, joined
 from planner_service.tree.queue_choice import grow_tree
 from shared_map.array_files import Bools, Floats, private_copy
-from shared_map.terrain.step_climb import Climb
+from shared_map.terrain.slope_and_climb import Climb
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec, Window
 
@@ -66,7 +66,7 @@ _SMALL = 1 << 20
 
 
 class Walks(NamedTuple):
-    """Routes read off a tree, as `kernels.route_walk` describes them."""
+    """Routes read off a tree, as `kernels.route_kernels` describes them."""
 
     directions: NDArray[np.uint8]
     ends: Cells
@@ -129,7 +129,7 @@ class CostGrid:
         """The original `cell_cost`, if that is mapped: `share` sets it, `load` resets it."""
         self._written: Bools = np.zeros(self.size // _BLOCK + 1, np.bool_)
         """Blocks of `_BLOCK` cells in which a cell cost has changed since `share`. `apply` sets it."""
-        self._moves = route_walk.moves_of(self.stride, self.rule)
+        self._moves = route_kernels.moves_of(self.stride, self.rule)
         self._make_scratch()
 
     def _make_scratch(self) -> None:
@@ -366,12 +366,12 @@ class CostGrid:
         walks = statuses, ends, driven, length, last
         read = cell_cost, self.climbs, self._ways(parent, root), starts
         limits, metres, asked = (most, self.grid.cells), (self.grid.resolution_m, self.diagonal), starts.copy()
-        steps = route_walk.walk_routes(*read, limits, metres, walks, self._directions)
+        steps = route_kernels.walk_routes(*read, limits, metres, walks, self._directions)
         if steps > self._directions.size:
             self._directions = np.empty(2 * steps, np.uint8)
             starts[:] = asked
-            steps = route_walk.walk_routes(*read, limits, metres, walks, self._directions)
-        if steps == route_walk.BROKEN:
+            steps = route_kernels.walk_routes(*read, limits, metres, walks, self._directions)
+        if steps == route_kernels.BROKEN:
             raise AssertionError("a route does not end at the target: the tree is broken")
         return Walks(self._directions[:steps].copy(), ends, driven, length, last)
 
@@ -384,11 +384,11 @@ class CostGrid:
         if self._trail is None:
             self._trail = np.empty(self.grid.cells + 1, np.uint32), np.empty(self.grid.cells + 1)
         ways = self._ways(parent, root)
-        if not route_walk.drive_rests(cell_cost, self.climbs, ways, starts, known, self._trail, rests):
+        if not route_kernels.drive_rests(cell_cost, self.climbs, ways, starts, known, self._trail, rests):
             raise AssertionError("a route does not end at the target: the tree is broken")
         return rests
 
-    def _ways(self, parent: NDArray[np.uint8], root: int) -> route_walk.Ways:
+    def _ways(self, parent: NDArray[np.uint8], root: int) -> route_kernels.Ways:
         return parent, *self._moves, root, self.stride
 
     def passable(self, cell: int) -> bool:

@@ -16,16 +16,16 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from planner_service.kernels import stride_growth
+from planner_service.kernels import stride_networks
 from planner_service.kernels.cell_costs import cut_window, find_rim, merge_window
 from planner_service.kernels.climbs import climbs_in
 from planner_service.kernels.costs_from_parents import Walk, make_walk, mend
-from planner_service.kernels.cut_trees import point_routes
 from planner_service.kernels.layout import NONE, Labels, PaddedGrid, step_offsets
 from planner_service.kernels.lower_bounds import WindowBound
 from planner_service.kernels.parents_from_costs import point_to_parents
 from planner_service.kernels.repair import repair
-from planner_service.kernels.stride_growth import StrideNetwork
+from planner_service.kernels.route_kernels import point_routes
+from planner_service.kernels.stride_networks import StrideNetwork
 from planner_service.tree.cost_changes import Cells, Changes
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.partial_growth import PartialGrowth
@@ -177,9 +177,9 @@ class CostToGoTree:
         box = box_of(grid, window)
         row, col = divmod(self.root, grid.grid.cols)
         half = max(row - box[0], col - box[1], box[2] - 1 - row, box[3] - 1 - col)
-        scratch = stride_growth.make_scratch(network.centre.size, grid.size)
+        scratch = stride_networks.make_scratch(network.centre.size, grid.size)
         stamps = self._stamps_now(), self._now
-        visited: int = stride_growth.grow_strides(
+        visited: int = stride_networks.grow_strides(
             *(grid.padded, grid.climbs, self._labels, tuple(network), stamps, box, (2 * half, far), scratch)
         )
         self.exact = False
@@ -293,7 +293,7 @@ class CostToGoTree:
             stamps = self._stamps_now()
             ways = grid.padded, grid.climbs, self._labels
             trail = np.empty(grid.size, np.uint32)  # which holds the longest way
-            stride_growth.tighten(*ways, stamps, self._now, cells, trail)
+            stride_networks.tighten(*ways, stamps, self._now, cells, trail)
 
     def _stamps_now(self) -> NDArray[np.uint8]:
         if self._stamps is None:

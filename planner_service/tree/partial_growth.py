@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from planner_service.kernels import queue_dial
-from planner_service.kernels.cut_trees import box_of, stays_exact, walk_by_costs
 from planner_service.kernels.layout import NONE, TOO_FINE, WALL
+from planner_service.kernels.route_kernels import box_of, stays_exact, walk_by_costs
 from planner_service.tree.cost_changes import Cells, Changes
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.queue_choice import NARROW

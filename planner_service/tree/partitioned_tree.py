@@ -1,7 +1,7 @@
 """The exact tree of one target over a large map: it stays exact at every move, at a fraction of a growth.
 
-`kernels.partition` says how it is laid out, `kernels.partition_totals` where it is checked after a change, and
-`kernels.partition_search` why it ends, never has a cycle, and is optimal. A worker grows trees of either kind
+`kernels.tile_pieces` says how it is laid out, `kernels.piece_totals` where it is checked after a change, and
+`kernels.tile_search` why it ends, never has a cycle, and is optimal. A worker grows trees of either kind
 (`GrownTree`).
 """
 
@@ -14,9 +14,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from planner_service.kernels import partition, partition_search, partition_totals
+from planner_service.kernels import piece_totals, tile_pieces, tile_search
 from planner_service.kernels.layout import NONE, PaddedGrid
 from planner_service.kernels.lower_bounds import WindowBound
+from planner_service.kernels.tile_pieces import Tree
 from planner_service.tree.cost_changes import Cells, Changes
 from planner_service.tree.cost_grid import NO_COSTS, CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree, grow_window
@@ -59,24 +60,24 @@ class PartitionedTree:
         self.root = -1
         self.exact = False
         self.window_bound: WindowBound | None = None
-        self._across = -(-cost_grid.grid.cols // partition.SIDE)
-        self._count = count = -(-cost_grid.grid.rows // partition.SIDE) * self._across
-        self._piece = np.full(count * partition.CELLS, partition.NO_PIECE, np.uint8)
-        self._rim = np.zeros(count * partition.PIECES, np.float64)
-        self._totals = partition.make_totals(count)
+        self._across = -(-cost_grid.grid.cols // tile_pieces.SIDE)
+        self._count = count = -(-cost_grid.grid.rows // tile_pieces.SIDE) * self._across
+        self._piece = np.full(count * tile_pieces.CELLS, tile_pieces.NO_PIECE, np.uint8)
+        self._rim = np.zeros(count * tile_pieces.PIECES, np.float64)
+        self._totals = tile_pieces.make_totals(count)
         self._wanted = np.zeros(count, np.uint8)
         self._ends = np.zeros((2, count), np.float64)
-        self._tiles = partition.Tiles(
-            exits=np.zeros(count * partition.PIECES, np.uint8),
+        self._tiles = tile_pieces.Tiles(
+            exits=np.zeros(count * tile_pieces.PIECES, np.uint8),
             many=np.zeros(count, np.int32),
             wanted=self._wanted,
             falls=np.zeros((3, count), np.float64),
             ends=self._ends,
             across=self._across,
         )
-        self._scratch = partition.make_scratch(count, MOST_KEPT)
+        self._scratch = tile_pieces.make_scratch(count, MOST_KEPT)
         self._now = 0
-        self._stack = np.empty(count * partition.PIECES, np.int32)
+        self._stack = np.empty(count * tile_pieces.PIECES, np.int32)
         self._words = np.zeros((6, -(-count // 8)), np.int64)
         self._at_once = np.zeros(count)
         self._most = MOST_LOOKS * count + 64
@@ -87,10 +88,10 @@ class PartitionedTree:
         """The root has moved since totals were added up."""
 
     @property
-    def _arrays(self) -> tuple[PaddedGrid, partition.Tree]:
+    def _arrays(self) -> tuple[PaddedGrid, Tree]:
         """(map, tree) for kernels."""
         grid = self.cost_grid
-        return grid.padded, partition.Tree(self.parent, self._piece, self._rim, *self._totals, grid.pad(self.root))
+        return grid.padded, Tree(self.parent, self._piece, self._rim, *self._totals, grid.pad(self.root))
 
     def grow(self, root: int) -> None:
         """Grows the whole tree of a cell, exactly. Raises OutsideGridError if it is none of the grid, ValueError if
@@ -106,11 +107,11 @@ class PartitionedTree:
         self.cost_grid.check_root(root)
         self.parent = parent
         self.root = root
-        self._wanted[:] = partition.CHECK | partition.RELINK
-        row, col = (at // partition.SIDE for at in self.cost_grid.grid.row_col(root))
+        self._wanted[:] = tile_pieces.CHECK | tile_pieces.RELINK
+        row, col = (at // tile_pieces.SIDE for at in self.cost_grid.grid.row_col(root))
         rows, cols = np.divmod(np.arange(self._count), self._across)
         self._ends[0] = np.maximum(np.abs(rows - row), np.abs(cols - col))
-        self._relabel(np.full(self._count, partition.ALTERED))
+        self._relabel(np.full(self._count, tile_pieces.ALTERED))
         self._moved = True
         self._mend(math.inf, self._at_once)
 
@@ -133,7 +134,7 @@ class PartitionedTree:
         old_root = grid.pad(self.root)
         self.root = root
         changed = np.zeros(self._count, np.uint8)
-        partition_search.merge_parents(
+        tile_search.merge_parents(
             *self._arrays, self._tiles, self._scratch, (cost, parent, box, way), old_root, changed
         )
         self._relabel(changed)
@@ -155,12 +156,12 @@ class PartitionedTree:
         if changes.cells.size == 0:
             return 0
         changed = np.zeros(self._count, np.uint8)
-        partition_search.cut_parents(*self._arrays, self._across, changes.cells, changes.before, changed)
+        tile_search.cut_parents(*self._arrays, self._across, changes.cells, changes.before, changed)
         turn = self._ends[0].copy()
         self._relabel(changed)
         looked = self._mend(self._most, turn)
         lost = np.flatnonzero(changed | (self._ends[1] == np.inf))
-        partition_search.drop_cut_off(*self._arrays, self._tiles, lost)
+        tile_search.drop_cut_off(*self._arrays, self._tiles, lost)
         return looked if self.exact or not lost.size else -1
 
     def cost_at(self, cells: Cells) -> NDArray[np.float64]:
@@ -169,7 +170,7 @@ class PartitionedTree:
         if self._moved:
             self._add_up()
         costs = np.empty(cells.size, np.float64)
-        partition_totals.costs_at(*self._arrays, self._scratch, self._across, np.ascontiguousarray(cells), costs)
+        piece_totals.costs_at(*self._arrays, self._scratch, self._across, np.ascontiguousarray(cells), costs)
         return costs
 
     def time_at(self, cells: Cells) -> NDArray[np.float64]:
@@ -183,16 +184,16 @@ class PartitionedTree:
     def slack(self) -> tuple[float, float]:
         """Same as in `CostToGoTree`. Cell costs are float32, a few roundings; each step may leave `MOST_SLACK` of
         its cell's cost, and `Rounding` counts 2**24 for one."""
-        return 2.0**-21, partition.MOST_SLACK * 2.0**24
+        return 2.0**-21, tile_pieces.MOST_SLACK * 2.0**24
 
     def tighten(self, cells: Cells) -> None:
         """Does nothing: costs are always those driven."""
 
     def _relabel(self, changed: NDArray[np.uint8]) -> None:
-        """Labels again the changed tiles: uint8 (n,), `partition.COSTLIER` or more."""
-        partition.relabel_tiles(*self._arrays, self._tiles, self._scratch, np.flatnonzero(changed), changed)
+        """Labels again the changed tiles: uint8 (n,), `tile_pieces.COSTLIER` or more."""
+        tile_pieces.relabel_tiles(*self._arrays, self._tiles, self._scratch, np.flatnonzero(changed), changed)
 
-    def _schedule(self, turn: NDArray[np.float64]) -> partition.Schedule:
+    def _schedule(self, turn: NDArray[np.float64]) -> tile_pieces.Schedule:
         """Returns the schedule for `improve_tiles`; totals are up to date after that call."""
         self._now += self._moved
         now = self._now if self._moved else 0
@@ -200,20 +201,20 @@ class PartitionedTree:
         order = np.argsort(self._ends[0])
         place = np.empty_like(order)
         place[order] = np.arange(order.size)
-        return partition.Schedule(order, place, turn, now, self._stack, self._words.view(np.uint8), self._words)
+        return tile_pieces.Schedule(order, place, turn, now, self._stack, self._words.view(np.uint8), self._words)
 
     def _add_up(self) -> None:
         """Evaluates the totals."""
-        partition_totals.add_up(*self._arrays, self._tiles, self._scratch, self._schedule(self._at_once))
+        piece_totals.add_up(*self._arrays, self._tiles, self._scratch, self._schedule(self._at_once))
 
     def _mend(self, most: float, turn: NDArray[np.float64]) -> int:
         """Checks tiles until the tree is exact, or as many as `most` have been."""
-        looked, mended, rounds, left = partition_search.improve_tiles(
+        looked, mended, rounds, left = tile_search.improve_tiles(
             *self._arrays, self._tiles, self._scratch, self._schedule(turn), most
         )
         self.exact = not left
         self.work = looked, mended, rounds
-        return int(looked) * partition.CELLS
+        return int(looked) * tile_pieces.CELLS
 
 
 AnyTree = CostToGoTree | PartitionedTree

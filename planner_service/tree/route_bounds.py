@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from planner_service.kernels import lower_bounds as kernels
 from planner_service.kernels.repair import repair
-from planner_service.kernels.route_walk import OK
+from planner_service.kernels.route_kernels import OK
 from planner_service.tree.cost_changes import Changes
 from planner_service.tree.cost_grid import NO_COSTS, CostGrid
 from planner_service.tree.cost_to_go import NO_WINDOW, CostToGoTree

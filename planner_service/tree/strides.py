@@ -7,8 +7,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from planner_service.kernels import stride_network
-from planner_service.kernels.stride_growth import StrideNetwork
+from planner_service.kernels import stride_networks
+from planner_service.kernels.stride_networks import StrideNetwork
 from planner_service.tree.cost_changes import Cells
 from planner_service.tree.cost_grid import CostGrid
 from shared_map.array_files import Bytes, Floats
@@ -40,7 +40,7 @@ class Links:
 
 def all_cells(cost_grid: CostGrid) -> NDArray[np.int32]:
     """Returns `node` for `find_stride` where there is no stride before: all passable cells."""
-    return np.where(cost_grid.cell_cost < np.inf, stride_network.OPEN, np.int32(-1))
+    return np.where(cost_grid.cell_cost < np.inf, stride_networks.OPEN, np.int32(-1))
 
 
 def find_strides(grid: CostGrid) -> StrideNetwork:
@@ -69,13 +69,13 @@ def find_stride(
     padded, offsets, size = grid.padded, grid.padded[1], grid.size
     room = min(stride, grid.grid.rows) * min(stride, grid.grid.cols)
     most = np.empty(size, np.uint32)
-    many = stride_network.cut_blocks(padded, stride, node, most, np.empty(room, np.uint32))
+    many = stride_networks.cut_blocks(padded, stride, node, most, np.empty(room, np.uint32))
     centre = most[:many].copy()
     del most
     cost, parent = np.empty(size, np.float32), np.empty(size, np.uint8)
     depth, place = np.empty(size, np.int32), np.empty(size, np.int32)
     heap = np.empty(room, np.float32), np.empty(room, np.int64)
-    stride_network.find_ways_to_centres(padded, node, centre, cost, parent, depth, (*heap, place))
+    stride_networks.find_ways_to_centres(padded, node, centre, cost, parent, depth, (*heap, place))
     del place, heap
     steps, price = _joining_steps(grid, node, cost, many)
     u, v = steps >> 3, (steps >> 3) + offsets[steps & 7]
@@ -88,7 +88,7 @@ def find_stride(
     length = np.concatenate((depth[u] + depth[v] + 1, depth[below])).astype(np.int64)
     paths = np.empty(int(length.sum()), np.uint8)
     steps = np.concatenate((steps, ~below))
-    stride_network.write_paths(offsets, parent, depth, steps, np.cumsum(length) - length, paths, centre, node)
+    stride_networks.write_paths(offsets, parent, depth, steps, np.cumsum(length) - length, paths, centre, node)
     return centre, Links(ends, price, length, paths)
 
 
@@ -97,7 +97,7 @@ def _joining_steps(grid: CostGrid, node: NDArray[np.int32], cost: Floats, many: 
     room = 1 << (8 * many + 16).bit_length()
     while True:
         pairs, prices, steps = np.zeros(room, np.int64), np.empty(room, np.float32), np.empty(room, np.int64)
-        if stride_network.join_nodes(grid.padded, node, cost, many, pairs, prices, steps) >= 0:
+        if stride_networks.join_nodes(grid.padded, node, cost, many, pairs, prices, steps) >= 0:
             break
         room *= 2
     found = np.flatnonzero(pairs)

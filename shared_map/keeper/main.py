@@ -10,10 +10,10 @@ from shared_map.keeper.service import KeeperService
 from shared_map.keeper.zone_orders import ZONE_MODULES
 from shared_map.terrain.store import load_terrain
 from swarm.bus.bus import Bus
-from swarm.recording.role_process import run_role
+from swarm.recording.record_inputs import run_role
 from swarm.recording.service_boundary import Boundary
-from swarm.runtime.first_use import Modules
 from swarm.runtime.inbox import Inbox
+from swarm.runtime.loop_health import Modules
 from swarm.runtime.role_setup import RoleSetup
 
 TICK_HZ = 10.0

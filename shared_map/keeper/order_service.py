@@ -16,8 +16,7 @@ from shared_map.terrain.map_frame import MapFrame
 from shared_map.terrain.terrain import Terrain
 from swarm.bus.bus import Appeared, Asked, Bus, Disappeared, Event, Heard, Post, Replied
 from swarm.clock import NS_PER_S
-from swarm.config.agent_plan import agent_of, plan_agents
-from swarm.config.scenario import Scenario
+from swarm.config.scenario import Scenario, agent_of, plan_agents
 from swarm.config.vehicle_classes import GROUND
 from swarm.errors import ConfigError, StoreError
 from swarm.peers import Peer

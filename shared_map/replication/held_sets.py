@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import numpy as np
 
-from shared_map.learning.measurements import measurements_in
+from shared_map.pace_measurements import measurements_in
 from shared_map.replication.author_limits import Capacity
 from shared_map.replication.digest import Held, Ledger, Place, fingerprint
 from shared_map.replication.marks import fault, is_tombstone, is_zone, supersedes

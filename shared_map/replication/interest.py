@@ -15,8 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shared_map.replication.tiles import beyond_tile, of_all_classes, region_tiles
-from swarm.config.agent_plan import readable_groups
-from swarm.config.scenario import Scenario
+from swarm.config.scenario import Scenario, readable_groups
 from swarm.config.setting_types import RESERVED_GROUP
 from swarm.grid import REGION_CELLS, GridSpec
 
@@ -165,7 +164,7 @@ class DigestInterest:
         self._keepers: dict[str, int] = {}  # keeper -> until when it counts as heard
         self._authors: dict[str, int] = {}  # author -> until when it counts as near
         self._all_until_ns = 0  # listen to everybody until then, at least
-        self._all_due_ns = 0  # and again from then on
+        self._all_digests_due_ns = 0  # and again from then on
         self._all_since_ns: int | None = None  # when that began; None: only those of `_named` are listened to
         self._named: dict[str, int] = {}  # sender -> since when it has been listened to, of those by name
 
@@ -173,7 +172,7 @@ class DigestInterest:
         """Everybody is listened to from now on, until a keeper is heard."""
         self._all_since_ns = now_ns
         self._all_until_ns = now_ns + _ALL_FOR * self._period_ns
-        self._all_due_ns = self._all_until_ns + self._phase_ns
+        self._all_digests_due_ns = self._all_until_ns + self._phase_ns
 
     def listen_to_all(self, now_ns: int) -> None:
         """Subscribes to all digests after a link came back: missed sets may belong to any author."""
@@ -191,8 +190,8 @@ class DigestInterest:
         """Returns the senders of digests to subscribe to from now on; None for all."""
         self._keepers = {keeper: until for keeper, until in self._keepers.items() if now_ns <= until}
         self._authors = {author: until for author, until in self._authors.items() if now_ns <= until}
-        if now_ns >= self._all_due_ns:
-            self._all_due_ns = now_ns + _ALL_EVERY * self._period_ns
+        if now_ns >= self._all_digests_due_ns:
+            self._all_digests_due_ns = now_ns + _ALL_EVERY * self._period_ns
             self.listen_to_all(now_ns)
         if not self._near or not self._keepers or now_ns < self._all_until_ns:
             if self._all_since_ns is None:

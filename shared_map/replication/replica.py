@@ -10,7 +10,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from shared_map.learning.measurements import Measurement, columns_of
+from shared_map.pace_measurements import Measurement, columns_of
 from shared_map.replication import marks
 from shared_map.replication.author_limits import Capacity
 from shared_map.replication.digest import Held
@@ -330,7 +330,7 @@ class MapReplica:
         self._put_own(tile, marks.sparse(own))
 
     def write_learned(self, measured: Mapping[int, Measurement], now_ns: int) -> list[MarkSet]:
-        """States what we have learned (`shared_map.learning.measurements`), instead of what was stated before."""
+        """States what we have learned (`shared_map.learned_factors`), instead of what was stated before."""
         self._put_own(beyond_tile(self.grid), marks.Statements(*columns_of(measured, now_ns)))
         return self.tick(now_ns)
 

@@ -17,7 +17,7 @@ _TILE_MASK = TILE_CELLS - 1
 
 def beyond_tile(grid: GridSpec) -> int:
     """The number after the last tile. Sets about it state nothing of cells, but what their authors have learned
-    (`shared_map.learning.measurements`)."""
+    (`shared_map.pace_measurements`)."""
     return grid.tiles
 
 

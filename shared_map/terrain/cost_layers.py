@@ -13,8 +13,7 @@ from swarm.config.plugin_names import cost_layers_of
 from swarm.config.scenario import Scenario
 from swarm.errors import TerrainError
 from swarm.grid import GridSpec
-from swarm.plugins.find import Plugin, find_plugin
-from swarm.plugins.guard import Guard, Nonsense
+from swarm.plugins import Guard, Nonsense, Plugin, find_plugin
 from swarm.wire.messages.map_data import PACE_LEAST, PACE_MOST
 
 

@@ -3,8 +3,8 @@
 The merge rule, per cell, in this order:
 
 1. pace = flat pace x slope factor x class factor; on a road the road pace instead.
-   With `cost.directional` the slope factor is left out, and each step costs by its rise instead (`step_climb`). No
-   finite pace is above `PACE_MOST` or below `PACE_LEAST`.
+   With `cost.directional` the slope factor is left out, and each step costs by its rise instead
+   (`slope_and_climb`). No finite pace is above `PACE_MOST` or below `PACE_LEAST`.
 2. Voids, ground steeper than `max_slope_deg`, and lethal classes are lethal.
    Then the scenario's own layers (`cost_layers`), one after the other; a void stays lethal.
 3. Zones in the order written: a pace sets the pace of open ground, a factor multiplies it, preferred halves, rough
@@ -16,7 +16,7 @@ The merge rule, per cell, in this order:
    `vehicle_radius_m` in its middle would touch a lethal cell.
 5. Marks replace the ground cell by cell (see `cost_map`), before inflation.
 
-Costly is not lethal: a factor, however large, never makes a cell infinite. Slope factors are in `slope_rules`,
+Costly is not lethal: a factor, however large, never makes a cell infinite. Slope factors are in `slope_and_climb`,
 zones in `zones`.
 """
 
@@ -30,7 +30,7 @@ import numpy as np
 
 from shared_map.array_files import Bools, Bytes, Floats
 from shared_map.terrain.row_bands import in_bands, padded_rows
-from shared_map.terrain.slope_rules import slope_factor
+from shared_map.terrain.slope_and_climb import slope_factor
 from swarm.config.ground import CostConfig
 from swarm.grid import GridSpec
 from swarm.wire.messages.map_data import PACE_LEAST, PACE_MOST

@@ -27,18 +27,18 @@ from numpy.typing import NDArray
 from shared_map.array_files import Bools, Floats, give_back_memory, open_array, save_array, source_digest
 from shared_map.terrain.pace_layers import largest_part
 from shared_map.terrain.row_bands import Progress, no_progress
-from shared_map.terrain.step_climb import ENTRIES, Climb, Wind
+from shared_map.terrain.slope_and_climb import ENTRIES, Climb, Wind
 from shared_map.terrain.terrain import FORMAT, Terrain, build_terrain
 from shared_map.terrain.true_ground import build_truth
 from shared_map.terrain.zones import files_of_zone
 from swarm.config.input_files import FileKind, read_text
-from swarm.config.load import BUILT_IN_TERRAINS
 from swarm.config.plugin_names import cost_layers_of
 from swarm.config.scenario import Scenario
+from swarm.config.toml_files import BUILT_IN_TERRAINS
 from swarm.errors import StoreError, SwarmError, TerrainError
 from swarm.files import write_file, writing
 from swarm.grid import GridSpec
-from swarm.plugins.find import source_of
+from swarm.plugins import source_of
 from swarm.runtime.role_setup import RoleSetup
 
 log = logging.getLogger(__name__)

@@ -26,8 +26,10 @@ from swarm.bus.bus import (
     LinkChanged,
     Post,
     Replied,
+    check_meant,
     check_subscription,
     counter_of,
+    meant_for,
     new_counts,
     newest_of,
 )
@@ -37,7 +39,6 @@ from swarm.errors import ProtocolError
 from swarm.peers import Peer
 from swarm.wire.access import Authenticator, check_code, code_of
 from swarm.wire.codec import decode, decode_either, encode
-from swarm.wire.meant_key import check_meant, meant_for
 from swarm.wire.messages import Message
 from swarm.wire.topics import TOPICS, Topic, check_size
 

@@ -39,7 +39,9 @@ from swarm.bus.bus import (
     Replied,
     Undecoded,
     asker_in,
+    check_meant,
     check_subscription,
+    meant_for,
 )
 from swarm.bus.endpoints import keeps_open, wait_for_router, why_not_listening, why_unreachable
 from swarm.bus.zenoh_config import patterned, session_config
@@ -48,7 +50,6 @@ from swarm.errors import BusError, ProtocolError
 from swarm.peers import Peer
 from swarm.wire.access import Authenticator, code_of
 from swarm.wire.codec import decode_either, encode, encode_json
-from swarm.wire.meant_key import check_meant, meant_for
 from swarm.wire.messages import Message
 from swarm.wire.topics import ALIVE_KEY, Priority, Topic, check_size, peer_of
 

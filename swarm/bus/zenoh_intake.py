@@ -16,10 +16,10 @@ from typing import Any
 import zenoh
 
 from swarm.bus import bus
+from swarm.bus.bus import SHARED, check_meant, check_named
 from swarm.errors import ProtocolError
 from swarm.wire import codec
 from swarm.wire.access import Act, Authenticator, check_code
-from swarm.wire.meant_key import SHARED, check_meant, check_named
 from swarm.wire.messages import Message
 from swarm.wire.topics import Topic, check_size
 
@@ -40,7 +40,7 @@ class Arrivals:
     """
 
     def __init__(self, most: int, weight: Callable[[Any], int] = lambda item: 1) -> None:
-        self._items: SimpleQueue[Any] = SimpleQueue()
+        self._received: SimpleQueue[Any] = SimpleQueue()
         """Received items; None ends the queue."""
         self._most, self._weight = most, weight
         self._waiting = 0
@@ -55,16 +55,16 @@ class Arrivals:
             fits = self._waiting + weight <= self._most
             self._waiting += weight if fits else 0
         if fits:
-            self._items.put(item)
+            self._received.put(item)
         return fits
 
     def end(self) -> None:
         """The entity is undeclared."""
-        self._items.put(None)
+        self._received.put(None)
 
     def take(self) -> Any:
         """The next item, once there is one; None after the last."""
-        item = self._items.get()
+        item = self._received.get()
         if item is not None:
             with self._lock:
                 self._waiting -= self._weight(item)

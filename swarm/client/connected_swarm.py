@@ -355,8 +355,8 @@ def connect(
     """
     from swarm.bus.zenoh_bus import open_bus
     from swarm.config.explain import explain
-    from swarm.config.load import check_endpoint
     from swarm.config.scenario import NetworkConfig, TlsConfig
+    from swarm.config.toml_files import check_endpoint
     from swarm.runtime.inbox import Inbox
     from swarm.runtime.run_secret import authenticator_of
 

@@ -13,7 +13,7 @@ from swarm.client.route import Route
 from swarm.client.session import Session, Stream
 from swarm.client.terrain_frame import checked_cells
 from swarm.clock import NS_PER_S
-from swarm.config.agent_plan import agent_of
+from swarm.config.scenario import agent_of
 from swarm.errors import ConfigError
 from swarm.grid import TILE_CELLS, GridSpec
 from swarm.wire.messages import map_data, planning

@@ -53,7 +53,7 @@ Dynamics = Literal["ground"]
 
 
 def plugin_name(built_in: Any = None) -> Meta:
-    """Names of one kind: those that are built in, and those of plug-ins (`swarm.config.plugin_names`)."""
+    """Names of one kind: those that are built in, and those of plug-ins (`swarm.plugins`)."""
     names = list(get_args(built_in))
     return Meta(
         pattern=r"^[\w.+-]{1,100}(:[\w.]{1,100})?\Z",

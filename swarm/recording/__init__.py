@@ -9,7 +9,7 @@ A service is deterministic but for what it reads, so a recording is enough to re
    readings, then key, length and digest of each output. The file can be torn anywhere (`recording_file`).
 3. `replay_service` makes the service again behind the same boundary, feeds it the recorded calls and readings, and
    compares its outputs one by one. The first difference ends the replay and is named with its event.
-4. `role_process` runs a role's service behind its boundary, from the opening of its bus to its end.
+4. `record_inputs.run_role` runs a role's service behind its boundary, from the opening of its bus to its end.
 
 Results of a worker's jobs are not recorded, only when they were taken and what the job read: the job runs again.
 Outputs are recorded as digests: a recording shows that an output differs, but not its content.

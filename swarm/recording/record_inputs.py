@@ -1,4 +1,4 @@
-"""Recording what enters and leaves a service while it runs."""
+"""Recording what enters and leaves a service while it runs, and the process of a recorded role."""
 
 from __future__ import annotations
 
@@ -11,14 +11,17 @@ from pathlib import Path
 from platform import python_version
 from typing import Any, TypeVar
 
-from swarm.bus.bus import Asked, Event, Post, WorkDone, Worker
-from swarm.clock import NS_PER_S
-from swarm.config.write import scenario_text
+from swarm.bus.bus import Asked, Bus, Event, Post, WorkDone, Worker
+from swarm.bus.zenoh_bus import open_bus
+from swarm.clock import NS_PER_S, MonotonicClock
+from swarm.config.toml_files import scenario_text
 from swarm.errors import StoreError
 from swarm.recording import recording_file
 from swarm.recording.service_boundary import Boundary, Crossing, content_of, pack
-from swarm.runtime.process import Service
+from swarm.runtime.inbox import Inbox
+from swarm.runtime.process import Process, Service
 from swarm.runtime.role_setup import RoleSetup
+from swarm.runtime.run_secret import authenticator_of
 from swarm.runtime.stats import Counters
 
 T = TypeVar("T")
@@ -220,3 +223,36 @@ def recorded(setup: RoleSetup, terrain: str) -> Iterator[Boundary]:
         ended = True
     finally:
         recording.close(ended=ended)
+
+
+Make = Callable[[Boundary, Bus, Callable[[], None]], Service]
+"""Makes a service, given its boundary, its bus, which is behind that, and what ends the process."""
+
+
+def run_role(
+    setup: RoleSetup,
+    terrain: str,
+    built: Callable[[], None],
+    make: Make,
+    inbox: Inbox,
+    tick_hz: float,
+    phase: float | None = None,
+) -> None:
+    """Runs a role's service until SIGTERM or SIGINT.
+
+    terrain  digest (hash) of the terrain on which the role runs
+    built    called once the service is there
+    phase    as of `Process`
+    """
+    network = setup.scenario.network
+    with (
+        open_bus(network, patient=True, authenticator=authenticator_of(network, setup.run_id)) as bus,
+        recorded(setup, terrain) as boundary,
+    ):
+        service = make(boundary, boundary.bus(bus), lambda: process.stop())
+        process = Process(
+            boundary.service(service), inbox, MonotonicClock(), tick_hz, phase, setup.health, bus.gather
+        )
+        process.stop_on_signals()
+        built()
+        process.run()

@@ -24,8 +24,8 @@ from typing import Annotated, Any, BinaryIO, Literal
 import msgspec
 
 from swarm.bus import bus
-from swarm.config.agent_plan import AddedAgent
 from swarm.config.input_files import FileKind, check_bytes
+from swarm.config.scenario import AddedAgent
 from swarm.errors import ProtocolError, StoreError
 from swarm.peers import Peer
 from swarm.recording.service_boundary import content_of

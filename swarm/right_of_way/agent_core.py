@@ -14,7 +14,7 @@ import msgspec
 from msgspec.structs import replace
 
 from swarm.clock import NS_PER_S
-from swarm.config.agent_plan import agent_of
+from swarm.config.scenario import agent_of
 from swarm.errors import StoreError
 from swarm.grid import REGION_CELLS
 from swarm.right_of_way.holdings import Tell, Wish

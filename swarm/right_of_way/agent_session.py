@@ -11,7 +11,7 @@ from msgspec.structs import replace
 
 from swarm.bus.bus import Appeared, Asked, AskEnded, Bus, Disappeared, Event, Heard, Post, Replied
 from swarm.clock import NS_PER_S
-from swarm.config.agent_plan import plan_agents
+from swarm.config.scenario import plan_agents
 from swarm.peers import Peer
 from swarm.right_of_way.agent_core import Action, OwnRecord, RightOfWay
 from swarm.right_of_way.holdings import Tell, Wish

@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping, Sequence, Set
 from functools import lru_cache
 
-from swarm.config.agent_plan import agent_of
+from swarm.config.scenario import agent_of
 from swarm.wire.messages.traffic import Before, Entry, Fence, Held, Number, Stamp, Table
 
 _NO_ENTRIES: Sequence[Number] = []

@@ -37,7 +37,7 @@ class Host(Holdings):
         self._twins = Roster()
         """Other processes of this host, as a second start of it: of these one generation counts."""
         self._alone_since_ns: int | None = None
-        self._led_ns: dict[int, int] = {}
+        self._leader_heard_ns: dict[int, int] = {}
         """Shard that concerns us -> when its leader was heard last."""
 
     def hear_known(self, known: Known) -> None:
@@ -97,15 +97,15 @@ class Host(Holdings):
     def unled(self, now_ns: int) -> dict[int, str]:
         """Reason why vehicles of ours wait: shard -> that no leader of it is heard."""
         views = self._views
-        self._led_ns = {
-            shard: max(self._led_ns.get(shard, now_ns), views[shard].heard_ns) for shard in self.watched
+        self._leader_heard_ns = {
+            shard: max(self._leader_heard_ns.get(shard, now_ns), views[shard].heard_ns) for shard in self.watched
         }
-        found = {}
-        for shard, heard_ns in self._led_ns.items():
+        reasons = {}
+        for shard, heard_ns in self._leader_heard_ns.items():
             if now_ns - heard_ns > _UNLED_NS and (vehicles := views[shard].seen):
                 members = self.shards.members(shard)
-                found[shard] = (
+                reasons[shard] = (
                     f"{len(vehicles)} vehicles of this agent wait: the agents which grant the next cells "
                     f"({', '.join(members)}) do not answer, or too late; {self.shards.majority} of them must"
                 )
-        return found
+        return reasons

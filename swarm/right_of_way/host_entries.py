@@ -26,7 +26,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 
-from swarm.config.agent_plan import agent_of
+from swarm.config.scenario import agent_of
 from swarm.wire.messages.traffic import Before, Entry, Number, Stamp
 
 _MOST_HEARD = 1 << 13

@@ -15,7 +15,7 @@ from itertools import chain
 from zlib import crc32
 
 from swarm.clock import NS_PER_S
-from swarm.config.agent_plan import agent_of
+from swarm.config.scenario import agent_of
 from swarm.right_of_way.cell_orders import Orders, cells_beside
 from swarm.right_of_way.generations import HEARTBEAT_NS, is_far_ahead, is_said, keep_last
 from swarm.right_of_way.holdings import STATES_KEPT, TABLES_KEPT

@@ -14,7 +14,7 @@ from itertools import chain
 
 from msgspec.structs import replace
 
-from swarm.config.agent_plan import agent_of
+from swarm.config.scenario import agent_of
 from swarm.right_of_way.cell_orders import Orders
 from swarm.right_of_way.generations import is_said
 from swarm.right_of_way.holdings import part_of
@@ -54,20 +54,20 @@ def agreed(tables: Collection[Table]) -> Table:
     in the cell again by a later one."""
     newest_first = sorted(tables, key=lambda table: table.stamp, reverse=True)
     lists = [_listed(table) or {} for table in newest_first]
-    listed = Counter((number, vehicle) for each in lists for number, (vehicle, _) in each.items())
+    counts = Counter((number, vehicle) for each in lists for number, (vehicle, _) in each.items())
     in_cell = Counter(chain.from_iterable({(number[0], each[0]) for number, each in of.items()} for of in lists))
-    kept: dict[Number, str] = {}
+    agreed_on: dict[Number, str] = {}
     cells: set[tuple[int, str]] = set()
-    for number, vehicle in sorted(listed, key=lambda each: (listed[each] > 1, each[0][1:]), reverse=True):
+    for number, vehicle in sorted(counts, key=lambda each: (counts[each] > 1, each[0][1:]), reverse=True):
         place = number[0], vehicle
-        if listed[number, vehicle] > 1 or (in_cell[place] > 1 and place not in cells and number not in kept):
-            kept[number] = vehicle
+        if counts[number, vehicle] > 1 or (in_cell[place] > 1 and place not in cells and number not in agreed_on):
+            agreed_on[number] = vehicle
             cells.add(place)
     hosts: dict[str, tuple[int, int]] = {}
     for table in newest_first:
         hosts.update((name, max(said, hosts.get(name, said))) for name, said in table.hosts.items())
     entries: dict[tuple[str, int], dict[str, list[Number]]] = {}
-    for number, vehicle in (each for each in listed if kept.get(each[0]) == each[1]):
+    for number, vehicle in (each for each in counts if agreed_on.get(each[0]) == each[1]):
         host = agent_of(vehicle)
         of = [each[number][1] for each in lists if each.get(number, ("", 0))[0] == vehicle]
         # The latest has it by an honest member's word that those before have ended: to fence it for an earlier one
@@ -175,11 +175,11 @@ class Witness:
         """Returns True if a table may replace the one on file: what it omits is over by the word of its own host,
         what it adds is for a host that has spoken and comes after all that remains in its cell, and it counts no
         statement that was not made. Hosts of which a statement is missed are asked for it by the next words."""
-        was, lists = _listed(old), _listed(new)
-        if was is None or lists is None:
+        old_entries, new_entries = _listed(old), _listed(new)
+        if old_entries is None or new_entries is None:
             return False
-        added = [(number, each) for number, each in lists.items() if was.get(number) != each]
-        if not self._may_follow(old, new) or (added and not self._may_have(added, lists, new)):
+        added = [(number, each) for number, each in new_entries.items() if old_entries.get(number) != each]
+        if not self._may_follow(old, new) or (added and not self._may_have(added, new_entries, new)):
             return False
         self._lacks = {
             host: []
@@ -187,13 +187,13 @@ class Witness:
             if said != old.hosts.get(host) and (host not in self._hosts or said > self._hosts[host].newest)
         }
         # A vehicle of which all generations have ended before a table counted one begins in its cell again.
-        begins = {(number[0], each[0]) for number, each in added if number not in was}
+        begins = {(number[0], each[0]) for number, each in added if number not in old_entries}
         last: dict[int, Number] = {}
-        for number, (vehicle, generation) in was.items():
-            found, host = lists.get(number), agent_of(vehicle)
+        for number, (vehicle, generation) in old_entries.items():
+            new_entry, host = new_entries.get(number), agent_of(vehicle)
             known = self._hosts.get(host)
             anew = not generation and known is not None and known.ended and (number[0], vehicle) in begins
-            if anew or found == (vehicle, generation) or self._passes((vehicle, generation), found, number):
+            if anew or new_entry == (vehicle, generation) or self._passes((vehicle, generation), new_entry, number):
                 last[number[0]] = max(number, last.get(number[0], number))
             elif known is None or not known.is_over(number, vehicle, generation, begins=vehicle in new.grants):
                 self._lacks.setdefault(host, []).append(number)
@@ -206,12 +206,12 @@ class Witness:
         # An earlier number that is new here was left, and its host has told others so, unless it still holds it.
         return not self._lacks and all(
             (
-                number not in was
+                number not in old_entries
                 and number > last.get(number[0], ())
                 and number[1:] <= new.stamp
                 and (old.stamp < number[1:] or number in self._hosts[agent_of(each[0])].held)
             )
-            or self._passes(was.get(number), each, number)
+            or self._passes(old_entries.get(number), each, number)
             for number, each in added
         )
 
@@ -227,10 +227,10 @@ class Witness:
             for fence in new.fences
         )
 
-    def _may_have(self, added: Iterable[tuple[Number, tuple[str, int]]], lists: _Entries, new: Table) -> bool:
+    def _may_have(self, added: Iterable[tuple[Number, tuple[str, int]]], new_entries: _Entries, new: Table) -> bool:
         """Returns True if additions are cells of the shard, for vehicles that there are, and no more than leaders
         grant."""
-        counts = Counter(lists.values())
+        counts = Counter(new_entries.values())
         return not exceeds_externals(new, self._fleets) and all(
             self._shards.of(number[0]) == new.shard
             and each[0] in self._fleets.get(agent_of(each[0]), each)

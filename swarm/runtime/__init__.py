@@ -5,7 +5,7 @@ and answers in time under overload. Mechanisms of every role:
 
 `membership`     Shows that the process is alive, compares runs, publishes counters (`stats`) and alarms.
 `election`       Decides which of several processes with one job leads: by rank, heartbeats and a lease.
-`order_book`     Holds what operators have ordered. `order_client` is the side of those who obey, `operator` that of
+`order_book`     Holds what operators have ordered. `OrderClient` is the side of those who obey, `operator` that of
                  those who order.
 `tracker_ownership`  Decides which of several trackers owns a target.
 `loop_health`    Tells whether the loop turns, to other threads and processes and to systemd.

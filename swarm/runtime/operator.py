@@ -18,7 +18,7 @@ from msgspec.structs import replace
 
 from swarm.bus.bus import Appeared, AskEnded, Bus, Disappeared, Event, Replied
 from swarm.clock import date_ns
-from swarm.config.agent_plan import agent_of
+from swarm.config.scenario import agent_of
 from swarm.errors import BusError, ConfigError
 from swarm.peers import Roster, job_of
 from swarm.runtime.inbox import Inbox

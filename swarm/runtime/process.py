@@ -24,9 +24,8 @@ from zlib import crc32
 
 from swarm.bus.bus import Event, Post, WorkDone
 from swarm.clock import NS_PER_S, Clock
-from swarm.runtime.first_use import in_loop
 from swarm.runtime.inbox import Inbox
-from swarm.runtime.loop_health import Health
+from swarm.runtime.loop_health import Health, in_loop
 from swarm.runtime.stats import CPU_S, ENDED, FIRST_USES, RSS_BYTES, Counters
 
 if TYPE_CHECKING:
@@ -57,7 +56,7 @@ class JobSlots:
 
     def __init__(self, folder: Path | None, most: int | None = None, longest_s: float = _LONGEST_S) -> None:
         most = most or len(os.sched_getaffinity(0))
-        self._paths = [] if folder is None else [folder / f"turn-{index}.lock" for index in range(most)]
+        self._turn_locks = [] if folder is None else [folder / f"turn-{index}.lock" for index in range(most)]
         self._longest_s = longest_s
 
     @contextmanager
@@ -73,15 +72,15 @@ class JobSlots:
 
     def _queue(self, held: ExitStack) -> None:
         until_s = time.monotonic() + self._longest_s
-        while self._paths and time.monotonic() < until_s:
-            for path in self._paths:
-                file = path.open("ab")
+        while self._turn_locks and time.monotonic() < until_s:
+            for path in self._turn_locks:
+                lock_file = path.open("ab")
                 try:
-                    fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+                    fcntl.flock(lock_file, fcntl.LOCK_EX | fcntl.LOCK_NB)
                 except BlockingIOError:
-                    file.close()
+                    lock_file.close()
                 else:
-                    held.enter_context(file)
+                    held.enter_context(lock_file)
                     return
             time.sleep(_RETRY_S)
 

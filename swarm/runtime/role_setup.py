@@ -5,8 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from swarm.config.agent_plan import AddedAgent, crew_of
-from swarm.config.scenario import Scenario
+from swarm.config.scenario import AddedAgent, Scenario, crew_of
 from swarm.config.vehicle_classes import class_numbers
 from swarm.grid import REGION_CELLS, GridSpec
 from swarm.runtime.loop_health import Health

@@ -42,7 +42,7 @@ MAX_ITEMS = 1 << 18
 64 bytes of memory, so a payload of 8 MiB could otherwise take half a gigabyte."""
 
 KEY_FIELD = "key"
-"""The field of every payload which names the key for which it is meant (`wire.meant_key`). No message has a field
+"""The field of every payload which names the key for which it is meant (`bus.bus`). No message has a field
 of that name."""
 
 M = TypeVar("M", bound=Message)

@@ -26,7 +26,7 @@ from rich.console import Console
 from rich.progress import Progress
 from rich.table import Table
 
-from launch_scripts.observe.run_folder import processor
+from launch_scripts.observe.run_folders import processor
 from swarm.errors import ConfigError
 
 BENCHMARKS = {

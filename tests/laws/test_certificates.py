@@ -14,7 +14,7 @@ from support.slow_twins import lower_bound
 from support.tree_lives import Findings, Life, lives
 
 from planner_service.kernels.layout import NONE
-from planner_service.kernels.partition import MOST_SLACK
+from planner_service.kernels.tile_pieces import MOST_SLACK
 from planner_service.target_tree import TargetTree
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree

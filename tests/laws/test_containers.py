@@ -21,10 +21,16 @@ from laws.test_deploy_plan import PLANS
 from support.effort import few
 
 from launch_scripts.cli import command
+from launch_scripts.deploy.machine_archives import (
+    COMPOSE_FILE,
+    HEALTH_PORT,
+    compose_files,
+    containers_of,
+    dns_label,
+)
 from launch_scripts.deploy.machine_plan import Plan
-from launch_scripts.deploy.service_files import COMPOSE_FILE, HEALTH_PORT, compose_files, containers_of, dns_label
 from launch_scripts.process_table import TABLE
-from swarm.config.load import parse_scenario
+from swarm.config.toml_files import parse_scenario
 
 LABEL = re.compile(r"[a-z0-9]([a-z0-9-]{0,61}[a-z0-9])?")
 EXAMPLE = Path(__file__).parents[2] / "docs" / "examples" / "kubernetes" / "swarm.yaml"

@@ -10,13 +10,19 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.effort import few
 
-from launch_scripts.deploy.hosts import HOST_ROLES, HostConfig, HostsConfig
-from launch_scripts.deploy.machine_plan import Plan, cores_of, make_plan
+from launch_scripts.deploy.machine_plan import HOST_ROLES, HostConfig, HostsConfig, Plan, cores_of, make_plan
 from launch_scripts.launcher.run_options import UpOptions, chosen_processes
 from launch_scripts.process_table import LAUNCHER, processes_of
 from swarm.bus.zenoh_config import access_control
-from swarm.config.agent_plan import plan_agents
-from swarm.config.scenario import GroupConfig, PlannerConfig, Scenario, StandbyConfig, TargetConfig, VehicleConfig
+from swarm.config.scenario import (
+    GroupConfig,
+    PlannerConfig,
+    Scenario,
+    StandbyConfig,
+    TargetConfig,
+    VehicleConfig,
+    plan_agents,
+)
 from swarm.errors import ConfigError
 
 SCENARIOS = st.builds(

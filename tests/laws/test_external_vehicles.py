@@ -13,7 +13,7 @@ from support import broken_rules as rules
 from support.external_world import ExternalProcess, ExternalWorld
 from support.traffic_world import Faults, random_faults
 
-from swarm.config.agent_plan import agent_of
+from swarm.config.scenario import agent_of
 from swarm.right_of_way.cell_orders import Orders
 from swarm.right_of_way.external_vehicle import ExternalVehicle
 from swarm.right_of_way.host import Host

@@ -9,7 +9,7 @@ from support.planner_strategies import RULES, random_climb, random_pace
 from planner_service.goal_tree_cache import GoalTrees
 from planner_service.target_tree import TargetTree
 from planner_service.tree.partial_growth import PartialGrowth
-from shared_map.terrain.step_climb import Climb
+from shared_map.terrain.slope_and_climb import Climb
 from swarm.config.scenario import PlannerConfig
 from swarm.config.setting_types import Strategy
 from swarm.grid import GridSpec, Window, walk

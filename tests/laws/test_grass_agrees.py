@@ -11,7 +11,7 @@ from support.kernel_oracle import inner, loaded
 from support.slow_twins import cost_to_go
 
 from planner_service.tree.cost_to_go import CostToGoTree
-from shared_map.terrain.slope_rules import directional_factor
+from shared_map.terrain.slope_and_climb import directional_factor
 from swarm.config.ground import CostConfig
 
 pytestmark = pytest.mark.skipif(shutil.which("grass") is None, reason="needs GRASS: apt-get install grass-core")

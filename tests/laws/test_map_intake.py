@@ -11,9 +11,9 @@ from support.makers import target_pose
 from support.planner_strategies import STRATEGIES, random_pace
 from support.scripted_planner import TICK, World, chasers
 
-from planner_service.map_intake import LONGEST_WAIT_NS
+from planner_service.followers import LONGEST_WAIT_NS
 from planner_service.planner import Planner
-from planner_service.search.search_triggers import Hidden, TargetSearch
+from planner_service.target_search import Hidden, TargetSearch
 from planner_service.target_tree import TargetTree
 from planner_service.tracker_notes import TargetWatch
 from shared_map.cost_map import CostMap

@@ -21,7 +21,7 @@ from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
 from planner_service.tree.strides import find_strides
 from shared_map.array_files import Floats
-from shared_map.terrain.step_climb import Climb
+from shared_map.terrain.slope_and_climb import Climb
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec, Window
 

@@ -13,11 +13,10 @@ from support.makers import run_info
 from support.swarm_model import SwarmModel
 from support.wire_strategies import BY_TYPE, MESSAGES
 
-from swarm.bus.bus import Asked, AskEnded, Heard
+from swarm.bus.bus import SHARED, Asked, AskEnded, Heard, MisroutedError, check_meant, meant_for
 from swarm.bus.memory_bus import MOST_SWAPPED, SWAPPED_NS, Swap
 from swarm.errors import ProtocolError
 from swarm.wire.codec import KEY_FIELD, decode, encode, encode_json, packed_json
-from swarm.wire.meant_key import SHARED, MisroutedError, check_meant, meant_for
 from swarm.wire.messages import Nothing
 from swarm.wire.messages.planning import CostRequest, RouteRequest, TargetPose
 from swarm.wire.messages.vehicles import Chasers

@@ -32,9 +32,8 @@ from shared_map.terrain.terrain import Terrain, build_terrain, terrain_of_pace
 from shared_map.terrain.true_ground import build_truth
 from swarm.bus.bus import Event, Replied
 from swarm.bus.scheduler import InlineWorker
-from swarm.config.agent_plan import plan_agents
-from swarm.config.load import parse_scenario
-from swarm.config.scenario import Scenario
+from swarm.config.scenario import Scenario, plan_agents
+from swarm.config.toml_files import parse_scenario
 from swarm.errors import ProtocolError
 from swarm.peers import Peer
 from swarm.right_of_way.promise_store import PromiseStore

@@ -16,7 +16,7 @@ from support.planner_strategies import RULES, random_pace
 
 from planner_service import growth_times
 from planner_service.kernels.layout import NONE
-from planner_service.kernels.partition import SIDE
+from planner_service.kernels.tile_pieces import SIDE
 from planner_service.tree import partitioned_tree as pieces
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree

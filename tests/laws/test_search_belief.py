@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 from support.effort import few
 from support.kernel_oracle import inner, loaded
 
-from planner_service.search.belief import Belief, blocks_of
-from planner_service.search.search_places import IDLE_S, Searcher, Ways
+from planner_service.search_belief import Belief, blocks_of
+from planner_service.target_search import IDLE_S, Searcher, Ways
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
-from shared_map.terrain.step_climb import Climb, climb_of
+from shared_map.terrain.slope_and_climb import Climb, climb_of
 from swarm.config.ground import CostConfig
 from swarm.grid import GridSpec, Window, walk
 from swarm.wire.route_columns import RouteStatus
@@ -158,7 +158,7 @@ def test_who_stands_where_it_was_sent_to_look_sees_something_of_that_block(
 ) -> None:
     pace = _pace(rows, cols, seed)
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr("planner_service.search.belief.MOST_BLOCKS", most_blocks)
+        patch.setattr("planner_service.search_belief.MOST_BLOCKS", most_blocks)
         searcher, ways = begun(pace, costs_of(pace), range_m, seed=seed)
     blocks = searcher.belief.blocks
     for n, cell in enumerate(np.random.default_rng(seed).choice(np.flatnonzero(np.isfinite(pace)), 4).tolist()):

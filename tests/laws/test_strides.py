@@ -14,8 +14,8 @@ from support import slow_twins as naive
 from support.kernel_oracle import inner, loaded, unpadded
 from support.planner_strategies import RULES, random_pace
 
-from planner_service.kernels import stride_growth
-from planner_service.kernels.stride_growth import StrideNetwork
+from planner_service.kernels import stride_networks
+from planner_service.kernels.stride_networks import StrideNetwork
 from planner_service.tree import cost_to_go, strides
 from planner_service.tree.cost_to_go import CostToGoTree
 from planner_service.tree.strides import find_strides
@@ -132,9 +132,11 @@ def test_every_node_that_its_distance_asks_for_is_reached(seed: int, rules: dict
     tree.grow(root)
     half = int(ground.rng.integers(2, 6))
     kept = []
-    make = stride_growth.make_scratch
+    make = stride_networks.make_scratch
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(cost_to_go.stride_growth, "make_scratch", lambda *sizes: kept.append(make(*sizes)) or kept[0])
+        patch.setattr(
+            cost_to_go.stride_networks, "make_scratch", lambda *sizes: kept.append(make(*sizes)) or kept[0]
+        )
         far = int(ground.rng.integers(2, 70))
         tree.grow_strides(ground.costs.grid.around(root, half), ground.network, far)
     lowest, by, place = kept[0][3], kept[0][4], kept[0][2]

@@ -27,7 +27,7 @@ from support.planner_swarm import GRID, Swarm, flat
 from planner_service import growth_times
 from planner_service.growth_times import WindowSchedule, block_half
 from planner_service.strategy import STAGES
-from shared_map.terrain.step_climb import ENTRIES, Climb, climb_of
+from shared_map.terrain.slope_and_climb import ENTRIES, Climb, climb_of
 from swarm.config.ground import CostConfig
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec, Window

@@ -17,10 +17,10 @@ from support.segments import crossed
 
 from planner_service.any_angle_routes import Puller
 from planner_service.route_finder import RouteFinder
-from planner_service.search.search_places import Ways
+from planner_service.target_search import Ways
 from planner_service.tree.cost_to_go import CostToGoTree
-from shared_map.terrain.air import AirGround, air_ground
-from shared_map.terrain.step_climb import STILL, Wind, wind_of
+from shared_map.terrain.slope_and_climb import STILL, Wind, wind_of
+from shared_map.vehicle_class_grounds import AirGround, air_ground
 from swarm.config.scenario import PlannerConfig
 from swarm.config.vehicle_classes import AirConfig
 from swarm.grid import STEP_COL, STEP_ROW, GridSpec, walk

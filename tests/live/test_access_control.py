@@ -21,8 +21,7 @@ from support.processes import eventually
 from support.zenohd import Zenohd
 
 from launch_scripts.deploy.certificates import issue
-from launch_scripts.launcher.router import Admission
-from launch_scripts.launcher.router_door import FREE_TRIES
+from launch_scripts.launcher.router import FREE_TRIES, Admission
 from launch_scripts.ports import free_ports
 from swarm.bus.endpoints import host_port
 from swarm.bus.zenoh_config import ROUTER, Bearer, bearer, common_name, patterned, session_config

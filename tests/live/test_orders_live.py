@@ -17,8 +17,8 @@ from support.live_swarm import LiveSwarm, client, swarm
 from support.processes import eventually
 
 from launch_scripts.launcher.takeover import processes
-from shared_map.learning.learned_factors import name_of
-from shared_map.learning.measurements import ONE, Measurement
+from shared_map.learned_factors import name_of
+from shared_map.pace_measurements import ONE, Measurement
 from shared_map.replication.replica import MapReplica
 from shared_map.replication.tiles import beyond_region, beyond_tile
 from swarm.bus.bus import Heard

@@ -19,10 +19,10 @@ from support.processes import eventually
 from support.ros_node import PeerNode
 from support.ros_peer import RosPeer, ros_router, write_definitions
 
+from launch_scripts.gateways.ros2.gateway_settings import ROWS
 from launch_scripts.gateways.ros2.rmw import Qos
 from launch_scripts.gateways.ros2.ros_node import open_ros
 from launch_scripts.gateways.ros2.ros_types import types_of
-from launch_scripts.gateways.ros2.topic_table import ROWS
 from launch_scripts.ports import free_ports
 from swarm.bus.zenoh_bus import open_bus
 from swarm.config.scenario import NetworkConfig

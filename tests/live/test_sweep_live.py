@@ -14,9 +14,9 @@ from support.process_usage import in_session
 from support.processes import eventually
 from support.small_study import STUDY, dies_of_seed_one, write_study
 
-from launch_scripts.simulation.study import sweep
-from launch_scripts.simulation.study.study import load_study, plan
-from launch_scripts.simulation.study.sweep import RESULTS, ResultStore, Sweep, client_of, local_client, run_trials
+from launch_scripts.simulation import study_sweep
+from launch_scripts.simulation.study import load_study, plan
+from launch_scripts.simulation.study_sweep import RESULTS, ResultStore, Sweep, client_of, local_client, run_trials
 from launch_scripts.simulation.trials import run_trial
 from swarm.errors import BusError
 
@@ -41,8 +41,8 @@ def test_a_worker_that_is_killed_loses_no_trial_and_changes_no_result(tmp_path: 
 @pytest.mark.thorough
 def test_a_trial_that_kills_its_workers_is_given_up_and_no_other(tmp_path: Path, monkeypatch: pytest.MonkeyPatch):
     trials = plan(load_study(write_study(tmp_path)), tmp_path, "x")[0].trials
-    monkeypatch.setattr(sweep, "run_trial", dies_of_seed_one)
-    monkeypatch.setitem(sweep._SETTINGS, "distributed.scheduler.allowed-failures", 1)
+    monkeypatch.setattr(study_sweep, "run_trial", dies_of_seed_one)
+    monkeypatch.setitem(study_sweep._SETTINGS, "distributed.scheduler.allowed-failures", 1)
     with local_client(1) as client:
         found = {trial.seed: result for trial, result in run_trials(client, trials)}
     assert found.keys() == {0, 1, 2}
@@ -88,6 +88,6 @@ def test_a_scheduler_that_is_there_is_used_and_an_absent_one_named(tmp_path: Pat
     with local_client(1) as there, client_of(there.scheduler_info()["address"]) as client:
         [(_, result)] = run_trials(client, [trial])
         assert result.key == trial.key
-    monkeypatch.setattr(sweep, "_CONNECT_S", 0.5)
+    monkeypatch.setattr(study_sweep, "_CONNECT_S", 0.5)
     with pytest.raises(BusError, match="no scheduler of Dask answers"), client_of("tcp://127.0.0.1:1"):
         pass

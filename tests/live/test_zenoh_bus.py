@@ -31,7 +31,7 @@ from support.zenoh_router import Router
 from docs.generate.wire_page import JSON_PATH as WIRE_PAGE
 from docs.generate.wire_page import example, key_fields, put_from_outside
 from launch_scripts.ports import free_ports
-from swarm.bus.bus import Appeared, Asked, AskEnded, Disappeared, Heard, HeardMany, LinkChanged, Replied
+from swarm.bus.bus import Appeared, Asked, AskEnded, Disappeared, Heard, HeardMany, LinkChanged, Replied, meant_for
 from swarm.bus.zenoh_bus import ZenohBus, open_bus
 from swarm.clock import MonotonicClock
 from swarm.config.scenario import NetworkConfig
@@ -42,7 +42,6 @@ from swarm.runtime.operator import Operator
 from swarm.runtime.process import Process
 from swarm.wire.access import CODE_BYTES, Authenticator
 from swarm.wire.codec import encode, encode_json
-from swarm.wire.meant_key import meant_for
 from swarm.wire.messages import Nothing
 from swarm.wire.messages.orders import GiveOrder, Obeyed, Order, Orders
 from swarm.wire.messages.planning import CostRequest

@@ -9,10 +9,9 @@ import pytest
 from support.simulated import OrderedSimulation, agents, captures_by_class, cells, made, vehicles
 
 from launch_scripts.simulation.laws import LawBook
-from launch_scripts.simulation.simulated_process import Node
-from shared_map.terrain.air import clearance_floor
-from shared_map.vehicle_class_grounds import class_grounds
-from swarm.config.load import parse_scenario
+from launch_scripts.simulation.simulate import Node
+from shared_map.vehicle_class_grounds import class_grounds, clearance_floor
+from swarm.config.toml_files import parse_scenario
 from swarm.wire.messages.orders import ZoneOrder
 
 SECONDS = 12.0

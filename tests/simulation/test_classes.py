@@ -11,12 +11,12 @@ from support.simulated import OrderedSimulation, agents, captures_by_class, cell
 
 from launch_scripts.simulation.faults import random_plan
 from launch_scripts.simulation.laws import LawBook
-from launch_scripts.simulation.simulated_process import Node
+from launch_scripts.simulation.simulate import Node
 from shared_map.array_files import Bools
 from shared_map.keeper.zone_orders import zones_of
 from shared_map.vehicle_class_grounds import ClassGround, class_grounds
-from swarm.config.agent_plan import added_agent
-from swarm.config.load import parse_scenario
+from swarm.config.scenario import added_agent
+from swarm.config.toml_files import parse_scenario
 from swarm.config.vehicle_classes import ClassConfig, class_numbers
 from swarm.errors import ConfigError
 from swarm.wire.messages.orders import ZoneOrder

@@ -6,9 +6,9 @@ from typing import Any
 from support.simulated import ExternalVehicle, OrderedSimulation, cells
 
 from launch_scripts.simulation.sample_worlds import crowd, seeded
-from launch_scripts.simulation.simulated_process import Node
+from launch_scripts.simulation.simulate import Node
 from swarm.bus.bus import Event, Replied
-from swarm.config.agent_plan import added_agent
+from swarm.config.scenario import added_agent
 from swarm.wire.messages.orders import ZoneOrder
 from swarm.wire.messages.vehicles import Obstacle, Removed, RemoveVehicles
 from swarm.wire.topics import LEAVE, OBSTACLE

@@ -20,7 +20,7 @@ from launch_scripts.commands.result_commands import app
 from launch_scripts.simulation.faults import random_plan
 from launch_scripts.simulation.replay import recordings_of, replay_run
 from launch_scripts.simulation.sample_worlds import SMALL
-from planner_service.prepared_costs import PREPARED_COSTS, PreparedCosts
+from planner_service.planning_process import PREPARED_COSTS, PreparedCosts
 from shared_map.terrain.terrain import build_terrain
 from swarm.errors import ConfigError, StoreError
 from swarm.recording import recording_file

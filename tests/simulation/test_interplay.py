@@ -17,11 +17,10 @@ from support.simulated import ExternalVehicle, OrderedSimulation, cells
 from launch_scripts.simulation.faults import Partition, random_plan
 from launch_scripts.simulation.laws import ROUTED_WITHIN_S, LawBook
 from launch_scripts.simulation.sample_worlds import SMALL, crowd, seeded
-from launch_scripts.simulation.simulated_process import Node
+from launch_scripts.simulation.simulate import Node
 from shared_map.terrain.terrain import build_terrain
 from swarm.clock import NS_PER_S
-from swarm.config.agent_plan import added_agent
-from swarm.config.scenario import RoverConfig
+from swarm.config.scenario import RoverConfig, added_agent
 from swarm.wire.messages.orders import GiveOrder, ZoneOrder
 from swarm.wire.messages.vehicles import Obstacle, RemoveVehicles
 from swarm.wire.topics import LEAVE, OBSTACLE

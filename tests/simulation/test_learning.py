@@ -6,7 +6,7 @@ import pytest
 from launch_scripts.simulation.faults import random_plan
 from launch_scripts.simulation.sample_worlds import seeded
 from launch_scripts.simulation.simulate import Simulation
-from shared_map.learning.learned_factors import name_of
+from shared_map.learned_factors import name_of
 from swarm.config.scenario import Scenario
 
 SECONDS = 20.0

@@ -12,21 +12,20 @@ from rich.console import Console
 from support.simulated import OrderedSimulation
 
 from launch_scripts.commands.status_view import print_status, status_fields, status_of
-from launch_scripts.launcher.terminal_tables import live_table
+from launch_scripts.launcher.console import live_table
 from launch_scripts.monitor.ground_view import Scene
 from launch_scripts.monitor.rerun_outputs import Pen
 from launch_scripts.monitor.service import MonitorService
 from launch_scripts.monitor.terrain_mesh import TerrainMesh
-from launch_scripts.observe import fact_table as facts
+from launch_scripts.observe import run_state as facts
 from launch_scripts.observe.run_observer import OutsideObserver
 from launch_scripts.observe.run_state import RunState
-from launch_scripts.simulation.simulated_process import EPOCH_NS
+from launch_scripts.simulation.simulate import EPOCH_NS
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.bus.bus import Event
 from swarm.clock import NS_PER_S
-from swarm.config.agent_plan import added_agent
-from swarm.config.load import parse_scenario
-from swarm.config.scenario import RoverConfig, Scenario, StandbyConfig
+from swarm.config.scenario import RoverConfig, Scenario, StandbyConfig, added_agent
+from swarm.config.toml_files import parse_scenario
 from swarm.runtime.role_setup import RoleSetup
 from swarm.wire.messages.orders import GiveOrder, ZoneOrder
 

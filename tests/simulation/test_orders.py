@@ -10,7 +10,7 @@ from support.simulated import OrderedSimulation, agents, cells, vehicles
 from launch_scripts.simulation.faults import Crash, FaultPlan
 from launch_scripts.simulation.laws import LawBook
 from launch_scripts.simulation.sample_worlds import SMALL, seeded
-from launch_scripts.simulation.simulated_process import Node
+from launch_scripts.simulation.simulate import Node
 from launch_scripts.simulation.world.service import TargetsService
 from shared_map.terrain.terrain import Terrain, build_terrain
 from swarm.wire.messages.orders import GiveOrder, Obey, ZoneOrder

@@ -8,12 +8,11 @@ import numpy as np
 from support.simulated import agents, vehicles
 
 from launch_scripts.simulation.faults import Crash, FaultPlan
-from launch_scripts.simulation.simulate import Simulation
-from launch_scripts.simulation.simulated_process import Node
+from launch_scripts.simulation.simulate import Node, Simulation
 from planner_service.service import PlannerService
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.clock import NS_PER_S
-from swarm.config.load import parse_scenario
+from swarm.config.toml_files import parse_scenario
 from swarm.wire.messages.planning import Sighted
 from swarm.wire.messages.vehicles import VehicleState
 from vehicle_agent.service import AgentService

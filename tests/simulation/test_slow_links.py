@@ -9,8 +9,7 @@ from support.simulated import cells
 from launch_scripts.simulation.faults import FaultPlan
 from launch_scripts.simulation.laws import LawBook
 from launch_scripts.simulation.sample_worlds import crowd, world
-from launch_scripts.simulation.simulate import Simulation
-from launch_scripts.simulation.simulated_process import Node
+from launch_scripts.simulation.simulate import Node, Simulation
 from vehicle_agent.service import AgentService
 
 

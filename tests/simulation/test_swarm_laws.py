@@ -10,8 +10,7 @@ from launch_scripts.check.scenario_check import one_way_ground
 from launch_scripts.simulation.faults import Crash, FaultPlan, Partition, random_plan
 from launch_scripts.simulation.laws import LawBook
 from launch_scripts.simulation.sample_worlds import SMALL, seeded, world
-from launch_scripts.simulation.simulate import Simulation
-from launch_scripts.simulation.simulated_process import Node
+from launch_scripts.simulation.simulate import Node, Simulation
 from vehicle_agent.service import AgentService
 
 SECONDS = 24.0

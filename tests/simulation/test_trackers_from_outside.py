@@ -11,8 +11,7 @@ from support.simulated import vehicles
 from launch_scripts.simulation.faults import Crash, FaultPlan
 from launch_scripts.simulation.laws import LawBook
 from launch_scripts.simulation.sample_worlds import SMALL, seeded
-from launch_scripts.simulation.simulate import Simulation
-from launch_scripts.simulation.simulated_process import EPOCH_NS
+from launch_scripts.simulation.simulate import EPOCH_NS, Simulation
 from launch_scripts.simulation.world.service import TargetsService
 from planner_service.service import PlannerService
 from swarm.bus.bus import Event, Heard, Replied

@@ -12,8 +12,7 @@ import pytest
 from launch_scripts.simulation.faults import random_plan
 from launch_scripts.simulation.sample_worlds import SMALL, WIDE, crowd, seeded
 from launch_scripts.simulation.simulate import Simulation
-from swarm.config.agent_plan import agent_of
-from swarm.config.scenario import RoverConfig
+from swarm.config.scenario import RoverConfig, agent_of
 from swarm.right_of_way.cell_orders import Orders
 from swarm.right_of_way.shard_leader import Leader
 from swarm.wire.messages.traffic import Entry, Held, Number, Table

@@ -17,8 +17,8 @@ from shared_map.terrain.terrain import terrain_of_pace
 from swarm.bus.bus import Asked, Event, Heard
 from swarm.bus.memory_bus import LinkModel
 from swarm.clock import NS_PER_S
-from swarm.config.agent_plan import AgentPlan, plan_agents
-from swarm.config.load import parse_scenario
+from swarm.config.scenario import AgentPlan, plan_agents
+from swarm.config.toml_files import parse_scenario
 from swarm.grid import walk
 from swarm.peers import Peer
 from swarm.right_of_way.promise_store import PromiseStore

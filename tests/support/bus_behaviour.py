@@ -8,10 +8,9 @@ from support.bus_world import Box, World, answering, asked, heard_by, marks, not
 from support.makers import run_info
 
 from shared_map.replication.marks import packed
-from swarm.bus.bus import Appeared, AskEnded, Disappeared, Heard, HeardMany, LinkChanged, Replied
+from swarm.bus.bus import Appeared, AskEnded, Disappeared, Heard, HeardMany, LinkChanged, Replied, meant_for
 from swarm.peers import Peer
 from swarm.wire.codec import encode
-from swarm.wire.meant_key import meant_for
 from swarm.wire.messages import Nothing
 from swarm.wire.messages.map_data import MarksRequest
 from swarm.wire.messages.traffic import Stored

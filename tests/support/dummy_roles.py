@@ -14,7 +14,7 @@ from pathlib import Path
 from swarm.bus.bus import Event
 from swarm.clock import MonotonicClock
 from swarm.errors import ConfigError
-from swarm.plugins.guard import call_within
+from swarm.plugins import call_within
 from swarm.runtime.inbox import Inbox
 from swarm.runtime.process import Process
 from swarm.runtime.role_setup import RoleSetup

@@ -9,12 +9,12 @@ import pytest
 
 from launch_scripts.observe.recorder import Recorder
 from launch_scripts.report.report_and_tracks import make_report, write_report
+from launch_scripts.simulation.simulate import EPOCH_NS as BEGAN_NS
 from launch_scripts.simulation.simulate import Simulation
-from launch_scripts.simulation.simulated_process import EPOCH_NS as BEGAN_NS
 from shared_map.array_files import Floats
 from shared_map.terrain.terrain import Terrain
-from swarm.config.load import parse_scenario
 from swarm.config.scenario import Scenario
+from swarm.config.toml_files import parse_scenario
 from swarm.peers import Peer
 from swarm.wire.messages import Message
 

@@ -10,7 +10,7 @@ from support.planner_strategies import RULES, random_pace
 
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
-from shared_map.terrain.step_climb import Climb
+from shared_map.terrain.slope_and_climb import Climb
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import STEP_COL, STEP_ROW, GridSpec
 

@@ -18,11 +18,11 @@ from typing import Any, Literal, TypeVar
 import msgspec
 import numpy as np
 
-from shared_map.learning.measurements import KEYS, MOST, MOST_CELLS, ONE, Measurement, columns_of
+from shared_map.pace_measurements import KEYS, MOST, MOST_CELLS, ONE, Measurement, columns_of
 from shared_map.replication.marks import packed
 from shared_map.replication.tiles import beyond_tile, region_of
 from swarm.clock import NS_PER_S
-from swarm.config.agent_plan import agent_of
+from swarm.config.scenario import agent_of
 from swarm.config.vehicle_classes import GROUND, MOST_CLASSES
 from swarm.errors import OutsideGridError, ProtocolError
 from swarm.grid import GridSpec

@@ -11,12 +11,12 @@ from support import slow_twins as naive
 from support.kernel_oracle import inner
 from support.planner_strategies import Job, Marks, Move
 
-from planner_service.kernels.stride_growth import StrideNetwork
+from planner_service.kernels.stride_networks import StrideNetwork
 from planner_service.strategy import Strategy
 from planner_service.target_tree import TargetTree
 from planner_service.tree.cost_to_go import CostToGoTree
 from planner_service.tree.partitioned_tree import GrownTree, PartitionedTree
-from shared_map.terrain.step_climb import Climb
+from shared_map.terrain.slope_and_climb import Climb
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec, Window
 from swarm.wire.messages.map_data import PACE_LEAST, PACE_MOST

@@ -9,7 +9,7 @@ import numpy as np
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from shared_map.terrain.step_climb import ENTRIES, Climb, Wind, climb_of
+from shared_map.terrain.slope_and_climb import ENTRIES, Climb, Wind, climb_of
 from swarm.config.ground import CostConfig, SlopeRule
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec

@@ -8,9 +8,8 @@ import pytest
 from support.bus_world import Box, World, answering, asked, marks, waiting
 from support.makers import run_info
 
-from swarm.bus.bus import AskEnded, Event, Replied
+from swarm.bus.bus import AskEnded, Event, Replied, meant_for
 from swarm.wire.codec import encode
-from swarm.wire.meant_key import meant_for
 from swarm.wire.messages import Nothing
 from swarm.wire.messages.map_data import MarksRequest
 from swarm.wire.messages.traffic import Claim, Table

@@ -8,10 +8,10 @@ from collections.abc import Callable
 from types import SimpleNamespace
 from typing import Any
 
+from launch_scripts.gateways.ros2.gateway_settings import TopicRow
 from launch_scripts.gateways.ros2.rmw import Endpoint, NodeName, Qos
 from launch_scripts.gateways.ros2.ros_node import Input, Node
 from launch_scripts.gateways.ros2.ros_types import LARGEST_MESSAGE_BYTES, RosTypes
-from launch_scripts.gateways.ros2.topic_table import TopicRow
 
 
 class PeerNode(Node):

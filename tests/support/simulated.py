@@ -13,15 +13,13 @@ from msgspec.structs import replace
 
 from launch_scripts.process_table import ProcessSpec
 from launch_scripts.simulation.faults import OBSERVER, FaultPlan
-from launch_scripts.simulation.simulate import Simulation, run_to_end
-from launch_scripts.simulation.simulated_process import Node
+from launch_scripts.simulation.simulate import Node, Simulation, run_to_end
 from launch_scripts.simulation.world.service import TargetsService
 from shared_map.terrain.terrain import Terrain, build_terrain
 from swarm.bus.bus import AskEnded, Event, Replied
 from swarm.clock import NS_PER_S
-from swarm.config.agent_plan import AddedAgent, agent_of, plan_agents
-from swarm.config.load import parse_scenario
-from swarm.config.scenario import Scenario
+from swarm.config.scenario import AddedAgent, Scenario, agent_of, plan_agents
+from swarm.config.toml_files import parse_scenario
 from swarm.peers import ranked_id
 from swarm.right_of_way.external_session import ExternalService
 from swarm.right_of_way.generations import MemoryGenerations

@@ -14,7 +14,7 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import dijkstra
 
 from planner_service.tree.cost_to_go import NO_WINDOW, CostToGoTree
-from shared_map.terrain.step_climb import Climb
+from shared_map.terrain.slope_and_climb import Climb
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import STEP_COL, STEP_ROW, GridSpec
 from swarm.wire.route_columns import RouteBatch

@@ -10,7 +10,7 @@ from msgspec.structs import replace
 from support.traffic_world import Disk, Faults, Process, TrafficWorld
 
 from swarm.clock import NS_PER_S
-from swarm.config.agent_plan import agent_of
+from swarm.config.scenario import agent_of
 from swarm.right_of_way.agent_core import Action
 from swarm.right_of_way.cell_orders import Orders
 from swarm.right_of_way.holdings import Tell, part_of

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 from functools import cache
 
 from swarm.clock import NS_PER_S
-from swarm.config.agent_plan import agent_of
+from swarm.config.scenario import agent_of
 from swarm.grid import GridSpec
 from swarm.peers import Peer
 from swarm.right_of_way.agent_core import Action, OwnRecord, RightOfWay

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 from support.processes import eventually
 
-from launch_scripts.deploy.service_files import zenohd_config
+from launch_scripts.deploy.machine_archives import zenohd_config
 from swarm.bus.endpoints import listening
 from swarm.config.scenario import NetworkConfig
 

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from functools import partial
 from itertools import compress, pairwise
 
-from shared_map.terrain.step_climb import Climb
+from shared_map.terrain.slope_and_climb import Climb
 from swarm.clock import NS_PER_S
 from swarm.right_of_way.holdings import Holdings
 from swarm.wire.messages.traffic import Entry

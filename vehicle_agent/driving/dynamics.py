@@ -15,8 +15,7 @@ import numpy as np
 
 from swarm.config.vehicle_classes import ClassConfig
 from swarm.grid import GridSpec
-from swarm.plugins.find import Plugin
-from swarm.plugins.guard import Guard, Nonsense, Tell
+from swarm.plugins import Guard, Nonsense, Plugin, Tell
 from vehicle_agent.driving.motion import Motion, Point, middle_of, way_of
 
 _STRAIGHT_RAD = 1e-9

@@ -10,8 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarm.grid import GridSpec
-from swarm.plugins.find import Plugin
-from swarm.plugins.guard import Guard, Nonsense, Tell
+from swarm.plugins import Guard, Nonsense, Plugin, Tell
 from swarm.wire.messages.map_data import PACE_LEAST, PACE_MOST, MarkKind
 
 _TOLERANCE = np.float32(0.01)

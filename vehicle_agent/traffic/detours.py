@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 import numpy as np
 from numpy.typing import NDArray
 
-from shared_map.terrain.step_climb import Climb
+from shared_map.terrain.slope_and_climb import Climb
 from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec
 from vehicle_agent.driving.driven_vehicle import Vehicle

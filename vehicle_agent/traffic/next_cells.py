@@ -11,7 +11,7 @@ from zlib import crc32
 import numpy as np
 from numpy.typing import NDArray
 
-from shared_map.terrain.step_climb import Climb
+from shared_map.terrain.slope_and_climb import Climb
 from swarm.clock import NS_PER_S
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec, Window

@@ -89,8 +89,8 @@ class Adapter:
         """None: the vehicle is not driven."""
         self._arming: Arming | None = None
         """None: another controller arms the vehicle and sets its mode."""
-        self._tells: list[str] = []
-        self._told: set[str] = set()
+        self._untold: list[str] = []
+        self._told_this_minute: set[str] = set()
         """Sentences of this minute."""
         self._due_ns = Counter[str]()
         """Time when a thing that is done once a period is due again."""
@@ -105,9 +105,9 @@ class Adapter:
             case codec.Position():
                 self._hear_position(message, now_ns)
             case codec.Warned(text=text) if self._is_due("warning", _WARN_NS, now_ns):
-                self._tells.append(f"the vehicle says: {text}")
+                self._untold.append(f"the vehicle says: {text}")
             case codec.CommandAnswered() if self._arming is not None:
-                self._tells += self._arming.on_command_answer(message)
+                self._untold += self._arming.on_command_answer(message)
             case codec.ItemAsked() | codec.MissionAnswered() if isinstance(self._guide, guidance.Missions):
                 self._guide.on_mission_message(message)
 
@@ -119,7 +119,7 @@ class Adapter:
         """Takes in whether the swarm can be heard."""
         if up != self._swarm_up:
             lost = "the swarm is silent: its routes are followed no more"
-            self._tells.append("the swarm is back" if up else lost)
+            self._untold.append("the swarm is back" if up else lost)
         self._swarm_up = up
 
     def _hear_beat(self, beat: codec.Beat, now_ns: int) -> None:
@@ -127,14 +127,14 @@ class Adapter:
         if self.kind is None:
             self.kind = kind
             armed = "armed" if beat.armed else "disarmed"
-            self._tells.append(f"found {kind.name}, MAV_TYPE {beat.type}, {armed}")
+            self._untold.append(f"found {kind.name}, MAV_TYPE {beat.type}, {armed}")
             if self._wishes.target is not None:
                 try:
                     self._guide, self._arming = guidance.guidance_of(kind, self._frame, self._wishes)
                 except ConfigError as error:
-                    self._tells.append(f"the vehicle is not driven: {error}")
+                    self._untold.append(f"the vehicle is not driven: {error}")
         if kind != self.kind:
-            self._tells.append("another kind of vehicle speaks under the same number: it is ignored")
+            self._untold.append("another kind of vehicle speaks under the same number: it is ignored")
             return
         self._beat, self._beat_ns = beat, now_ns
 
@@ -160,9 +160,9 @@ class Adapter:
             actions += self._report(now_ns)
             actions += self._drive(now_ns)
             if self._arming is not None and self._arming.why:
-                self._tells.append(f"the vehicle's mode and motors are left alone from now on: {self._arming.why}")
+                self._untold.append(f"the vehicle's mode and motors are left alone from now on: {self._arming.why}")
                 self._arming = None
-        self._tells += [each for each in actions if isinstance(each, str)]
+        self._untold += [each for each in actions if isinstance(each, str)]
         return [*(each for each in actions if not isinstance(each, str)), *self._news(now_ns)]
 
     def stop(self, now_ns: int) -> list[Action]:
@@ -197,9 +197,9 @@ class Adapter:
             return []
         self._there = not why
         if not why:
-            self._tells.append("the vehicle is in the swarm")
+            self._untold.append("the vehicle is in the swarm")
             return []
-        self._tells.append(f"{why}: the vehicle is left to its own fail-safe")
+        self._untold.append(f"{why}: the vehicle is left to its own fail-safe")
         actions: list[Action] = []
         if self._guide is not None:
             self._guide.forget()
@@ -236,12 +236,12 @@ class Adapter:
     def _news(self, now_ns: int) -> list[str]:
         """Returns new sentences for people, each once a minute."""
         if self._is_due("minute", _SAY_AGAIN_NS, now_ns):
-            self._told.clear()
-        new = [each for each in dict.fromkeys(self._tells) if each not in self._told]
-        told = new[: _MOST_SAID - len(self._told)]
-        self._told.update(told)
-        self._tells.clear()
-        return told
+            self._told_this_minute.clear()
+        not_told = [each for each in dict.fromkeys(self._untold) if each not in self._told_this_minute]
+        sentences = not_told[: _MOST_SAID - len(self._told_this_minute)]
+        self._told_this_minute.update(sentences)
+        self._untold.clear()
+        return sentences
 
     def _is_due(self, what: str, every_ns: int, now_ns: int) -> bool:
         """Returns True once in a period."""

@@ -1,27 +1,75 @@
-"""Settings of the gateway to ROS 2: a TOML file, checked as scenarios are."""
+"""Settings of the gateway to ROS 2: a TOML file, checked as scenarios are; and the table of topics, `topics.toml`.
+
+What is in the table crosses between the swarm and ROS. Nothing else does.
+"""
 
 from __future__ import annotations
 
 import re
+import tomllib
 from collections import Counter
 from collections.abc import Iterator, Mapping
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated, Any, Literal
 
 import msgspec
 from msgspec import Meta
 
-from launch_scripts.gateways.ros2 import topic_table
+from launch_scripts.gateways.ros2.rmw import Qos
 from launch_scripts.gateways.ros2.ros_messages import TERRAIN_FRAME, ros_name
 from launch_scripts.gateways.ros2.ros_types import Distribution
 from swarm.config.explain import choice, converted
 from swarm.config.input_files import FileKind, parse_toml, read_text
-from swarm.config.load import is_loopback, with_settings
 from swarm.config.setting_types import Metres, Name, Positive, Section
+from swarm.config.toml_files import is_loopback, with_settings
 from swarm.errors import ConfigError
 from swarm.wire.messages.planning import GROUND
 from swarm.wire.messages.vehicles import LONGEST_OBSTACLE_LEASE_S, MOST_RADIUS_M
+
+VEHICLE, TARGET, ROBOT = "{vehicle}", "{target}", "{robot}"
+"""Stand in names for that of each vehicle, target or robot."""
+FRAMES = ("tf", "tf_static")
+"""Topics that each vehicle has for itself where its frames are bare."""
+POSE_TYPES = {
+    "odometry": "nav_msgs/msg/Odometry",
+    "pose": "geometry_msgs/msg/PoseStamped",
+    "pose_with_covariance": "geometry_msgs/msg/PoseWithCovarianceStamped",
+}
+"""Word in the settings -> type of the topic on which a robot says where it is."""
+
+
+@dataclass(frozen=True, slots=True)
+class TopicRow:
+    """One topic or service, or one for each vehicle, target or robot.
+
+    name       by which settings call it
+    type_name  such as nav_msgs/msg/Path
+    content    for people
+    hz         how often a message crosses, at most; None: when something changes
+    """
+
+    name: str
+    topic: str
+    type_name: str
+    qos: Qos
+    content: str
+    direction: str = "to ROS"
+    hz: float | None = None
+
+    @property
+    def per(self) -> str | None:
+        """Unit of which each has one: VEHICLE, TARGET, or None."""
+        return next((each for each in (VEHICLE, TARGET) if each in self.topic), None)
+
+
+def _rows(part: dict[str, Any]) -> dict[str, TopicRow]:
+    return {name: TopicRow(name, **{**row, "qos": Qos[row["qos"]]}) for name, row in part.items()}
+
+
+_TABLE = tomllib.loads(Path(__file__).with_name("topics.toml").read_text(encoding="utf-8"))
+ROWS, INCOMING = _rows(_TABLE["forward"]), _rows(_TABLE["incoming"])
+"""By name: topics that the swarm tells; and all that settings may let in, with what robots get."""
 
 ROS_ENDPOINT = "tcp/127.0.0.1:7447"
 """Default endpoint of rmw_zenohd: the same as a swarm's router."""
@@ -139,7 +187,7 @@ class Robots(Section, frozen=True, kw_only=True):
         """The robot that has a topic; None if it is none of these robots."""
         if self.id is not None:
             return self.id if topic == self.topic else None
-        before, _, after = self.topic.partition(topic_table.ROBOT)
+        before, _, after = self.topic.partition(ROBOT)
         found = re.fullmatch(rf"{re.escape(before)}([a-zA-Z][a-zA-Z0-9_]{{0,60}}){re.escape(after)}", topic)
         return found[1] if found else None
 
@@ -193,7 +241,7 @@ class IncomingSettings(Section, frozen=True, kw_only=True):
     orders: bool = False
 
     def set_pose_of(self, target: str) -> str:
-        return self.set_pose.replace(topic_table.TARGET, ros_name(target))
+        return self.set_pose.replace(TARGET, ros_name(target))
 
 
 class Settings(Section, frozen=True, kw_only=True):
@@ -213,14 +261,14 @@ class Settings(Section, frozen=True, kw_only=True):
     topics: dict[str, TopicSettings] = msgspec.field(default_factory=dict)
     incoming: IncomingSettings = IncomingSettings()
 
-    def rows(self) -> tuple[topic_table.TopicRow, ...]:
+    def rows(self) -> tuple[TopicRow, ...]:
         """The topics that are forwarded, as these settings have them."""
-        wanted = self.forward or tuple(topic_table.ROWS)
-        return tuple(self._changed(row) for name, row in topic_table.ROWS.items() if name in wanted)
+        wanted = self.forward or tuple(ROWS)
+        return tuple(self._changed(row) for name, row in ROWS.items() if name in wanted)
 
-    def _changed(self, row: topic_table.TopicRow) -> topic_table.TopicRow:
+    def _changed(self, row: TopicRow) -> TopicRow:
         changes = self.topics.get(row.name, TopicSettings())
-        before = f"/{topic_table.VEHICLE}" if self.frames.bare and row.name in topic_table.FRAMES else ""
+        before = f"/{VEHICLE}" if self.frames.bare and row.name in FRAMES else ""
         return replace(row, topic=before + (changes.topic or row.topic), hz=changes.hz or row.hz)
 
 
@@ -248,13 +296,13 @@ def parse_settings(text: str, source: str = "settings", options: Mapping[str, ob
 
 def _faults(settings: Settings) -> Iterator[str]:
     """Faults which no single key shows. Nothing behind the first one is to be relied upon."""
-    known = tuple(topic_table.ROWS)
+    known = tuple(ROWS)
     for key, given in (("forward", settings.forward), ("topics", tuple(settings.topics))):
         yield from (
             f"{key}: no topic {name!r} in the table{choice(name, known)}" for name in given if name not in known
         )
     for name, changes in settings.topics.items():
-        row = topic_table.ROWS[name]
+        row = ROWS[name]
         if changes.topic:
             yield from _topic_faults(changes.topic, row.per, f"topics.{name}.topic")
         if changes.hz and row.hz is None:
@@ -277,7 +325,7 @@ def _faults(settings: Settings) -> Iterator[str]:
 
 def _incoming_faults(settings: IncomingSettings) -> Iterator[str]:
     for n, robots in enumerate(settings.robots):
-        where, part = f"robots[{n}]", topic_table.ROBOT
+        where, part = f"robots[{n}]", ROBOT
         if (part in robots.topic) != (robots.id is None):
             yield f"{where}: topic is {robots.topic!r}, expected {part} in it, or an id and none in it"
         own = {key: getattr(robots, key).replace(part, robots.id or part) for key in ("topic", "plan", "goal")}
@@ -289,7 +337,7 @@ def _incoming_faults(settings: IncomingSettings) -> Iterator[str]:
              *((f"grids[{n}]", each.topic) for n, each in enumerate(settings.grids))]  # fmt: skip
     for area, topic in drawn:
         yield from _topic_faults(topic, None, f"{area}.topic")
-    yield from _topic_faults(settings.set_pose, topic_table.TARGET, "set_pose")
+    yield from _topic_faults(settings.set_pose, TARGET, "set_pose")
     robot_ids = [each.id for each in settings.robots if each.id]
     robot_topics = [each.topic for each in settings.robots]
     for key, names in {

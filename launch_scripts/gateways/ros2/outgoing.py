@@ -18,10 +18,9 @@ from msgspec import Struct
 from numpy.typing import NDArray
 
 from launch_scripts.gateways.ros2 import map_messages, ros_messages
-from launch_scripts.gateways.ros2.gateway_settings import Settings
+from launch_scripts.gateways.ros2.gateway_settings import TARGET, VEHICLE, Settings, TopicRow
 from launch_scripts.gateways.ros2.map_messages import MapFeed
 from launch_scripts.gateways.ros2.ros_messages import Level, PackedPlaces, Place, RosMessages, ros_name
-from launch_scripts.gateways.ros2.topic_table import TARGET, VEHICLE, TopicRow
 from shared_map.cost_map import merged
 from swarm.client.observer import Observer, SeenTarget, SeenVehicle
 from swarm.clock import NS_PER_S

@@ -20,9 +20,9 @@ from zenoh import ext
 from zenoh.handlers import Callback
 
 from launch_scripts.gateways.ros2 import rmw
+from launch_scripts.gateways.ros2.gateway_settings import TopicRow
 from launch_scripts.gateways.ros2.rmw import Endpoint, Kind, NodeName, Qos
 from launch_scripts.gateways.ros2.ros_types import REQUEST, RESPONSE, RosTypes
-from launch_scripts.gateways.ros2.topic_table import TopicRow
 from swarm.clock import NS_PER_S
 from swarm.errors import BusError, ProtocolError, SwarmError
 

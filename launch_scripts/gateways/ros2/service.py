@@ -13,15 +13,14 @@ from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
 
-from launch_scripts.gateways.ros2.gateway_settings import IncomingSettings, Settings
-from launch_scripts.gateways.ros2.incoming.dispatch import Incoming
+from launch_scripts.gateways.ros2.gateway_settings import ROWS, IncomingSettings, Settings
+from launch_scripts.gateways.ros2.incoming import Incoming
 from launch_scripts.gateways.ros2.map_messages import MapFeed
 from launch_scripts.gateways.ros2.outgoing import Channel, Gateway, Health, Say, ToWgs84
 from launch_scripts.gateways.ros2.rmw import Endpoint, PeerWatch
 from launch_scripts.gateways.ros2.ros_messages import RosMap, RosMessages
 from launch_scripts.gateways.ros2.ros_node import Node, Publisher, open_ros
 from launch_scripts.gateways.ros2.ros_types import types_of
-from launch_scripts.gateways.ros2.topic_table import ROWS
 from shared_map.terrain.store import find_prepared
 from swarm.client import Frame, Observer, Swarm, SwarmError
 from swarm.errors import ConfigError

@@ -9,10 +9,10 @@ from launch_scripts.simulation.world.walks import WAY_MODULES
 from shared_map.terrain.store import load_terrain, load_truth
 from shared_map.vehicle_class_grounds import load_classes
 from swarm.bus.bus import Bus
-from swarm.recording.role_process import run_role
+from swarm.recording.record_inputs import run_role
 from swarm.recording.service_boundary import Boundary
-from swarm.runtime.first_use import Modules
 from swarm.runtime.inbox import Inbox
+from swarm.runtime.loop_health import Modules
 from swarm.runtime.role_setup import RoleSetup
 
 

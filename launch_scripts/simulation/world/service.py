@@ -16,7 +16,7 @@ from swarm.clock import NS_PER_S
 from swarm.peers import HIGHEST_RANK, Roster, job_of, ranked_id
 from swarm.runtime.election import Candidacy
 from swarm.runtime.membership import Member, MemberService
-from swarm.runtime.order_client import OrderClient
+from swarm.runtime.order_book import OrderClient
 from swarm.runtime.role_setup import RoleSetup
 from swarm.runtime.stats import CAPTURES_BY, CAPTURES_OF
 from swarm.wire.messages.orders import Obey

@@ -26,7 +26,7 @@ from swarm.config.scenario import Scenario, TargetConfig, ids_of
 from swarm.config.vehicle_classes import aloft_classes
 from swarm.errors import ConfigError
 from swarm.places import cell_of, written
-from swarm.plugins.find import find_plugin
+from swarm.plugins import find_plugin
 from swarm.runtime.order_book import OrderBook
 from swarm.runtime.tracker_ownership import Trackings
 from swarm.wire.fields import column

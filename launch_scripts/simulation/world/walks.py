@@ -18,13 +18,12 @@ from numpy.typing import NDArray
 
 from shared_map.array_files import Bools, CellsOf
 from shared_map.terrain.pace_layers import largest_part
-from shared_map.terrain.step_climb import Climb
+from shared_map.terrain.slope_and_climb import Climb
 from swarm.config.ground import CostConfig
 from swarm.config.scenario import TargetConfig
 from swarm.errors import TerrainError
 from swarm.grid import STEP_COL, STEP_ROW, GridSpec, Window
-from swarm.plugins.find import Plugin
-from swarm.plugins.guard import Guard, Nonsense, Tell
+from swarm.plugins import Guard, Nonsense, Plugin, Tell
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array

@@ -15,8 +15,8 @@ from bench.harness import Seed, benchmark, track
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
 from shared_map.array_files import Floats
-from shared_map.terrain.air import AirGround, air_ground, clearance_floor
 from shared_map.terrain.terrain import build_terrain
+from shared_map.vehicle_class_grounds import AirGround, air_ground, clearance_floor
 from swarm.config.ground import TerrainConfig
 from swarm.config.scenario import PlannerConfig, Scenario
 from swarm.config.vehicle_classes import AirConfig

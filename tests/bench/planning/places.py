@@ -13,8 +13,7 @@ from bench.harness import FieldOption, Seed, benchmark, cpu_ms, track
 from planner_service.goal_tree_cache import GoalTrees
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
-from swarm.config.agent_plan import PLACE_TREES_BYTES
-from swarm.config.scenario import PlannerConfig
+from swarm.config.scenario import PLACE_TREES_BYTES, PlannerConfig
 from swarm.grid import Window
 from swarm.wire.route_columns import RouteStatus
 

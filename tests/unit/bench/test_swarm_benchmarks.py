@@ -14,7 +14,7 @@ from support.benchmarks import bench
 from support.makers import fleet_of
 
 from launch_scripts.launcher.run_options import find_scenario
-from swarm.config.agent_plan import plan_agents
+from swarm.config.scenario import plan_agents
 from swarm.runtime.stats import Counters
 from swarm.wire.messages.vehicles import Fleet, VehicleState
 

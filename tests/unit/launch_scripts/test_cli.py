@@ -19,8 +19,8 @@ from launch_scripts.commands.swarm_route import Answer, as_json, show, write
 from launch_scripts.launcher import run_options
 from launch_scripts.observe.run_observer import frame_of_members
 from shared_map.terrain.map_frame import MapFrame
-from swarm.config.load import load_scenario
 from swarm.config.scenario import MonitorConfig, Scenario, TlsConfig
+from swarm.config.toml_files import load_scenario
 from swarm.errors import BusError, TerrainError
 from swarm.grid import GridSpec
 from swarm.places import cell_of

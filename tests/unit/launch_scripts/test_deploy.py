@@ -7,7 +7,7 @@ from typing import Any
 import msgspec
 import pytest
 
-from launch_scripts.deploy.service_files import zenohd_config
+from launch_scripts.deploy.machine_archives import zenohd_config
 from launch_scripts.process_table import certificate_name, certificate_names
 from launch_scripts.simulation.sample_worlds import SMALL
 from launch_scripts.simulation.simulate import Simulation

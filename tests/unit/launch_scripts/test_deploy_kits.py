@@ -16,13 +16,11 @@ from typer.testing import CliRunner
 from launch_scripts.commands.deploy_commands import app
 from launch_scripts.deploy import certificates
 from launch_scripts.deploy.certificates import authority, called_of, check_signed, ends_on, hosts_of, issue
-from launch_scripts.deploy.hosts import HostsConfig, parse_hosts
-from launch_scripts.deploy.kits import keep_plan, keepers_before, write_kits
-from launch_scripts.deploy.machine_plan import Plan, make_plan
-from launch_scripts.deploy.service_files import UNIT, systemd_files
+from launch_scripts.deploy.machine_archives import UNIT, keep_plan, keepers_before, systemd_files, write_kits
+from launch_scripts.deploy.machine_plan import HostsConfig, Plan, make_plan, parse_hosts
 from launch_scripts.launcher.run_options import as_process, chosen_processes
-from swarm.config.load import load_scenario, parse_scenario
 from swarm.config.revocations import revoke
+from swarm.config.toml_files import load_scenario, parse_scenario
 from swarm.errors import ConfigError, StoreError
 
 SCENARIO = 'name = "small"\n[[targets]]\ncount = 2\n[[groups]]\nvehicles = 12\n[vehicles]\nper_agent = 3\n'

@@ -12,10 +12,9 @@ import msgspec
 import pytest
 from support.command import Swarm
 
-from launch_scripts.commands.ps_down_logs_commands import _chosen
+from launch_scripts.commands.run_commands import _chosen
 from launch_scripts.commands.shared_options import Where, find_swarm
-from launch_scripts.observe.local_runs import _started_s, register, registered
-from launch_scripts.observe.run_folder import begin_run, find_run
+from launch_scripts.observe.run_folders import _started_s, begin_run, find_run, register, registered
 from launch_scripts.ports import free_ports
 from swarm.config.scenario import NetworkConfig, Scenario
 from swarm.errors import BusError, ConfigError

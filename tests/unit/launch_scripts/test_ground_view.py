@@ -37,20 +37,20 @@ from launch_scripts.monitor.ground_view import (
 from launch_scripts.monitor.live_layout import COST, PHOTO
 from launch_scripts.monitor.rerun_outputs import Pen, in_markdown, shown
 from launch_scripts.monitor.terrain_mesh import Bytes, Floats, TerrainMesh
-from launch_scripts.observe import fact_table as facts
+from launch_scripts.observe import run_state as facts
 from launch_scripts.observe.palette import rgb
 from launch_scripts.observe.recorder import Recorder
 from launch_scripts.report.report_and_tracks import make_report, write_report
 from launch_scripts.report.run_page_and_map import QUICKER, SLOWER, learned_pixels
 from shared_map.cost_map import CostMap
-from shared_map.learning.learned_factors import LearnedGauges
-from shared_map.learning.measurements import ONE, Measurement
+from shared_map.learned_factors import LearnedGauges
+from shared_map.pace_measurements import ONE, Measurement
 from shared_map.replication.marks import zone_author
 from shared_map.replication.replica import MapReplica
 from shared_map.terrain.terrain import Terrain, terrain_of_pace
 from swarm.clock import NS_PER_S
-from swarm.config.load import parse_scenario
 from swarm.config.scenario import Scenario
+from swarm.config.toml_files import parse_scenario
 from swarm.grid import Window
 from swarm.runtime.stats import Counters
 from swarm.wire.messages.map_data import MarkKind, MarkSet

@@ -21,9 +21,16 @@ from hypothesis import strategies as st
 from support.idle_swarm import idle_swarm
 from support.processes import eventually
 
-from launch_scripts.launcher import hang_watch, local_processes
-from launch_scripts.launcher.hang_watch import LOOK_EVERY_S, STILL_S, Sight, Stillness
-from launch_scripts.launcher.local_processes import Ending, LocalSwarm, Running
+from launch_scripts.launcher import local_processes
+from launch_scripts.launcher.local_processes import (
+    LOOK_EVERY_S,
+    STILL_S,
+    Ending,
+    LocalSwarm,
+    Running,
+    Sight,
+    Stillness,
+)
 from launch_scripts.process_table import ProcessSpec
 from launch_scripts.web import HEALTHY, READY, Reply
 from launch_scripts.web.health_pages import Process, health_pages, verdict
@@ -385,7 +392,7 @@ def test_who_hangs_says_where_and_is_killed_if_it_cannot_but_not_while_it_starts
 def test_a_launcher_ends_what_hangs_with_where_in_its_log_and_starts_it_again(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(hang_watch, "STILL_S", 2.0)
+    monkeypatch.setattr(local_processes, "STILL_S", 2.0)
     swarm = idle_swarm(tmp_path, ("planner", "t0", "stand_still"))
     endings: list[Ending] = []
 

@@ -16,7 +16,7 @@ from support.command import Swarm
 
 from launch_scripts.launcher.console import Terminal
 from launch_scripts.launcher.log_file import FORMAT, JsonLines, Speaker
-from launch_scripts.observe.run_folder import DiskWatch
+from launch_scripts.observe.run_folders import DiskWatch
 
 WRITER = """
 import logging, os, resource, signal, sys

@@ -9,7 +9,7 @@ from support.command import Swarm
 from support.map_strategies import GRID, set_of
 
 from shared_map.keeper.mark_store import KeeperStore
-from shared_map.learning.measurements import Measurement
+from shared_map.pace_measurements import Measurement
 from shared_map.replication.replica import MapReplica
 from swarm.wire.messages.map_data import SEQ_STEP, MarkKind, MarkSet
 

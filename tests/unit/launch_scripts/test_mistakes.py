@@ -26,7 +26,7 @@ from launch_scripts.launcher.forkserver import WarmUp
 from launch_scripts.launcher.local_processes import LocalSwarm
 from launch_scripts.ports import free_ports
 from launch_scripts.process_table import certificate_names
-from swarm.config.load import load_scenario
+from swarm.config.toml_files import load_scenario
 
 MISTAKES: list[dict[str, Any]] = tomllib.loads(
     Path(__file__).with_name("mistakes.toml").read_text(encoding="utf-8")

@@ -19,13 +19,11 @@ from launch_scripts.check.scenario_check import not_made, one_way_share, places,
 from launch_scripts.simulation.world.walks import TrueTerrain
 from shared_map.terrain.terrain import terrain_of_pace
 from shared_map.vehicle_class_grounds import class_grounds
-from swarm.config.agent_plan import PLACE_TREES_BYTES, plan_agents
 from swarm.config.explain import expected, meanings
 from swarm.config.ground import TerrainConfig
-from swarm.config.load import load_scenario, parse_scenario, read_scenario
-from swarm.config.scenario import GroupConfig, Scenario, TargetConfig
+from swarm.config.scenario import PLACE_TREES_BYTES, GroupConfig, Scenario, TargetConfig, plan_agents
 from swarm.config.setting_types import Preset, Walk
-from swarm.config.write import commented
+from swarm.config.toml_files import commented, load_scenario, parse_scenario, read_scenario
 from swarm.errors import ConfigError
 from swarm.grid import GridSpec
 from vehicle_agent.start_cells import spawn_cells

@@ -23,7 +23,7 @@ from swarm.bus.endpoints import listening
 
 from launch_scripts.simulation.world.walks import WAY_MODULES
 from shared_map.keeper.zone_orders import ZONE_MODULES
-from swarm.runtime.first_use import Modules
+from swarm.runtime.loop_health import Modules
 
 Modules([*ZONE_MODULES, *WAY_MODULES]).wait()  # loaded beside the loops of one role each
 scenario, terrain = crowd("open", 1, 8, 4)

@@ -7,7 +7,7 @@ from rich.console import Console
 from support.makers import run_info, stats
 
 from launch_scripts.commands.status_view import table_of, top_fields
-from launch_scripts.launcher.terminal_tables import live_table, loads_table
+from launch_scripts.launcher.console import live_table, loads_table
 from launch_scripts.observe.recorder import Recorder
 from launch_scripts.observe.run_state import RunState
 from launch_scripts.observe.summed_counts import Counts

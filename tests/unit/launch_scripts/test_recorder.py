@@ -12,15 +12,15 @@ from support import makers
 from support.makers import fleet_of, planner_status, target_pose
 from support.map_strategies import set_of
 
-from launch_scripts.launcher.terminal_tables import plain_line
-from launch_scripts.observe import fact_table as facts
+from launch_scripts.launcher.console import plain_line
+from launch_scripts.observe import run_state as facts
 from launch_scripts.observe.alarms import Alarm as SeenAlarm
 from launch_scripts.observe.latest_messages import LatestState, plan_of
 from launch_scripts.observe.recorder import BegunRoute, Recorder, Sampling, Thinned
 from launch_scripts.observe.summed_counts import CertifiedGap
 from swarm.clock import NS_PER_S
-from swarm.config.load import parse_scenario
 from swarm.config.scenario import Scenario, StandbyConfig
+from swarm.config.toml_files import parse_scenario
 from swarm.grid import GridSpec
 from swarm.peers import Peer
 from swarm.runtime.stats import CAPTURES_OF, GAPS_TO, Counters

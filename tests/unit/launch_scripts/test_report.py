@@ -14,18 +14,17 @@ from matplotlib.image import imread
 from support import fake_run
 
 from launch_scripts.launcher.run_options import SCENARIOS, find_scenario
-from launch_scripts.observe.fact_table import verdict
 from launch_scripts.observe.latest_messages import VehicleColumns
 from launch_scripts.observe.recorder import Driven, Recorder
-from launch_scripts.observe.run_folder import begin_run, ended, find_run, point_last, read_report
-from launch_scripts.report import plots_and_cards as plots
+from launch_scripts.observe.run_folders import begin_run, ended, find_run, point_last, read_report
+from launch_scripts.observe.run_state import verdict
+from launch_scripts.report import plots_and_figures as plots
 from launch_scripts.report import run_page_and_map as picture
 from launch_scripts.report.report_and_tracks import TABLES, make_report, read_tracks, write_report
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.clock import NS_PER_S
-from swarm.config.load import load_scenario, parse_scenario
 from swarm.config.scenario import Scenario
-from swarm.config.write import scenario_text
+from swarm.config.toml_files import load_scenario, parse_scenario, scenario_text
 from swarm.errors import ConfigError, StoreError
 from swarm.files import write_file
 from swarm.grid import GridSpec

@@ -16,7 +16,7 @@ from msgspec.structs import replace
 from support.effort import few
 from support.ros_messages import path
 
-from launch_scripts.gateways.ros2.gateway_settings import Settings, load_settings, parse_settings
+from launch_scripts.gateways.ros2.gateway_settings import ROWS, Settings, load_settings, parse_settings
 from launch_scripts.gateways.ros2.map_messages import MapFeed, corners
 from launch_scripts.gateways.ros2.outgoing import Channel, Gateway, Health, Put
 from launch_scripts.gateways.ros2.rmw import NO_HASH, Endpoint, Kind, NodeName, PeerWatch, Qos
@@ -33,7 +33,6 @@ from launch_scripts.gateways.ros2.ros_messages import (
     ros_name,
 )
 from launch_scripts.gateways.ros2.ros_types import Distribution, RosTypes, types_of
-from launch_scripts.gateways.ros2.topic_table import ROWS
 from swarm.client.observer import SeenTarget, SeenVehicle
 from swarm.client.vehicle import OwnMarks
 from swarm.clock import NS_PER_S

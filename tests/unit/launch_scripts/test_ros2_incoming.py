@@ -18,20 +18,19 @@ from support.effort import few
 from support.ros_messages import path
 from support.ros_node import FakeNode
 
-from launch_scripts.gateways.ros2.gateway_settings import Robots
-from launch_scripts.gateways.ros2.incoming.ros_places import (
+from launch_scripts.gateways.ros2.gateway_settings import INCOMING, Robots
+from launch_scripts.gateways.ros2.ros_messages import RosMap, RosMessages, quaternion_of
+from launch_scripts.gateways.ros2.ros_node import Input, WorkQueue
+from launch_scripts.gateways.ros2.ros_places import (
     MOST_CELLS,
     FrameReader,
     Place,
-    Track,
+    RobotTrack,
     closed_cells,
     corners_of,
     robot_place,
 )
-from launch_scripts.gateways.ros2.ros_messages import RosMap, RosMessages, quaternion_of
-from launch_scripts.gateways.ros2.ros_node import Input, WorkQueue
 from launch_scripts.gateways.ros2.ros_types import types_of
-from launch_scripts.gateways.ros2.topic_table import INCOMING
 from swarm.clock import NS_PER_S
 from swarm.errors import ConfigError, ProtocolError
 from swarm.grid import GridSpec
@@ -101,7 +100,7 @@ def test_any_message_of_a_robot_is_a_valid_place_or_a_sentence(message: Any, off
 
 @given(st.lists(st.tuples(messages, st.integers(0, 3 * NS_PER_S)), max_size=30), st.floats(0.1, 50))
 def test_the_swarm_is_told_valid_places_at_a_bounded_rate_whatever_comes(words: Any, hz: float) -> None:
-    track = Track(FrameReader(MAP, "uav/odom"), 2.0)
+    track = RobotTrack(FrameReader(MAP, "uav/odom"), 2.0)
     told_ns: list[int] = []
 
     def take(message: Any, now_ns: int) -> None:
@@ -147,7 +146,7 @@ def test_a_robot_that_drives_backwards_is_told_to_go_where_it_goes() -> None:
 
 
 def test_poses_tell_a_speed_that_the_messages_do_not() -> None:
-    track = Track(FrameReader(MAP), 2.0)
+    track = RobotTrack(FrameReader(MAP), 2.0)
     track.on_reading(n(header=header(), pose=pose(50, 50)), 0)
     found = track.on_reading(n(header=header(), pose=pose(50, 53)), NS_PER_S)
     assert (found.heading_rad, found.speed_m_per_s) == (pytest.approx(0.0), pytest.approx(3.0))
@@ -155,7 +154,7 @@ def test_poses_tell_a_speed_that_the_messages_do_not() -> None:
 
 def test_a_reason_is_said_once_until_a_good_message_comes(caplog: pytest.LogCaptureFixture) -> None:
     node: Any = FakeNode(TYPES)
-    track = Track(FrameReader(MAP), 2.0)
+    track = RobotTrack(FrameReader(MAP), 2.0)
     poses = Input(node, "/uav/odom", INCOMING["robot"], track.on_reading)  # type: ignore[arg-type]
     for number, frame in enumerate(["odom"] * 20 + ["map", "odom"]):
         node.topics["/uav/odom"].waiting.append(odometry(50, 50, frame=frame))

@@ -10,14 +10,18 @@ from support.client_rig import Program
 from support.ros_node import FakeNode
 from support.swarm_model import SwarmModel
 
-from launch_scripts.gateways.ros2.gateway_settings import GridSettings, IncomingSettings, Robots, ZoneSettings
-from launch_scripts.gateways.ros2.incoming.dispatch import Incoming
-from launch_scripts.gateways.ros2.incoming.robot import Robot
+from launch_scripts.gateways.ros2.gateway_settings import (
+    INCOMING,
+    GridSettings,
+    IncomingSettings,
+    Robots,
+    ZoneSettings,
+)
+from launch_scripts.gateways.ros2.incoming import Incoming, Robot
 from launch_scripts.gateways.ros2.rmw import Endpoint, Kind, NodeName
 from launch_scripts.gateways.ros2.ros_messages import Level, RosMap, RosMessages
 from launch_scripts.gateways.ros2.ros_node import Input, WorkQueue
 from launch_scripts.gateways.ros2.ros_types import types_of
-from launch_scripts.gateways.ros2.topic_table import INCOMING
 from swarm.client import Route
 from swarm.clock import NS_PER_S
 
@@ -127,7 +131,7 @@ class Calls(list[tuple[str, Any]]):
 
 
 def test_areas_are_told_once_and_taken_away_where_they_are_drawn_no_more(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("launch_scripts.gateways.ros2.incoming.dispatch.WorkQueue", DoneAtOnce)
+    monkeypatch.setattr("launch_scripts.gateways.ros2.incoming.WorkQueue", DoneAtOnce)
     orders, author, node = Calls(), Calls(), FakeNode(TYPES)
     frame = Program(SwarmModel()).swarm.frame
     swarm: Any = SimpleNamespace(frame=frame, orders=lambda: orders, vehicle=lambda name: author)

@@ -13,9 +13,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from launch_scripts.gateways.ros2 import rmw
+from launch_scripts.gateways.ros2.gateway_settings import TopicRow
 from launch_scripts.gateways.ros2.ros_node import Input, Node
 from launch_scripts.gateways.ros2.ros_types import Distribution, types_of
-from launch_scripts.gateways.ros2.topic_table import TopicRow
 from swarm.errors import ProtocolError
 
 # The hashes as ROS nodes print them (`ros2 topic info -v`) and other stacks publish them.

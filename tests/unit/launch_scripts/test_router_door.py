@@ -11,8 +11,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support.processes import eventually
 
-from launch_scripts.launcher import router_door
-from launch_scripts.launcher.router_door import FREE_TRIES, Door, Knocks, missing_of_hello, neighbourhood
+from launch_scripts.launcher import router
+from launch_scripts.launcher.router import FREE_TRIES, Door, Knocks, missing_of_hello, neighbourhood
 from swarm.errors import BusError
 
 
@@ -36,7 +36,7 @@ def test_each_part_of_a_client_hello_lacks_the_rest() -> None:
 @given(st.binary(min_size=6, max_size=64))
 def test_anything_else_is_refused_or_waits_for_a_bounded_rest(head: bytes) -> None:
     with contextlib.suppress(ValueError):
-        assert missing_of_hello(head) <= router_door.MOST_HELLO_BYTES
+        assert missing_of_hello(head) <= router.MOST_HELLO_BYTES
         assert head[0] == 22
         assert head[5] == 1
 
@@ -149,7 +149,7 @@ def test_who_hangs_up_or_speaks_no_tls_is_not_passed_on(door: Door, inside: Insi
 
 
 def test_the_oldest_silent_connection_gives_way(door: Door, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(router_door, "MOST_WAITING", 4)
+    monkeypatch.setattr(router, "MOST_WAITING", 4)
     silent = [knock(door) for _ in range(12)]
     eventually(lambda: len(door.waiting) == 4, 10, "silent connections that are cut")
     with knock(door, HELLO) as visitor:

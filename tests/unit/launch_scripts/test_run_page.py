@@ -27,7 +27,7 @@ from launch_scripts.report.mcap_export import export_mcap, frame_names, instants
 from launch_scripts.report.report_and_tracks import GROUND_PACE_FILE, TRACKS_FILE, RunTracks, read_tracks
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.clock import NS_PER_S
-from swarm.config.write import scenario_text
+from swarm.config.toml_files import scenario_text
 from swarm.grid import GridSpec
 from swarm.wire.messages.map_data import STAMP_LIMIT_NS, MarkKind
 from swarm.wire.messages.processes import Note

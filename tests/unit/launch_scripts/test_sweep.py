@@ -16,10 +16,11 @@ from support.simulated import simulate
 from support.small_study import STUDY, write_study
 
 from launch_scripts.commands.simulation_commands import sweep_study
+from launch_scripts.simulation import study as statistics
 from launch_scripts.simulation.laws import BrokenLaw
 from launch_scripts.simulation.simulate import Simulation
-from launch_scripts.simulation.study import summary as statistics
-from launch_scripts.simulation.study.study import (
+from launch_scripts.simulation.study import (
+    Summary,
     combinations,
     load_study,
     parse_study,
@@ -27,10 +28,9 @@ from launch_scripts.simulation.study.study import (
     study_names,
     study_path,
 )
-from launch_scripts.simulation.study.summary import Summary
-from launch_scripts.simulation.study.sweep import ResultStore, Sweep
+from launch_scripts.simulation.study_sweep import ResultStore, Sweep
 from launch_scripts.simulation.trials import Result, Trial, run_trial
-from swarm.config.load import load_scenario
+from swarm.config.toml_files import load_scenario
 from swarm.errors import ConfigError, StoreError
 
 

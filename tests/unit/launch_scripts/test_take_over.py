@@ -16,10 +16,10 @@ from hypothesis import strategies as st
 from support.effort import few
 
 from launch_scripts.launcher import takeover
-from launch_scripts.launcher.launcher_health import LauncherHealth
 from launch_scripts.launcher.local_processes import Running
 from launch_scripts.launcher.run_options import UpOptions
 from launch_scripts.launcher.takeover import TakeOver, writing
+from launch_scripts.launcher.watcher import LauncherHealth
 from launch_scripts.observe.latest_messages import LatestState, RunPlan
 from launch_scripts.process_table import ProcessSpec
 from swarm.config.scenario import Scenario

@@ -11,9 +11,9 @@ from typer.testing import CliRunner
 from launch_scripts.commands.terrain_commands import app
 from launch_scripts.commands.terrain_routes import find_route
 from launch_scripts.launcher.run_options import find_scenario
-from launch_scripts.report import terrain_figure
+from launch_scripts.report import plots_and_figures
 from shared_map.terrain.terrain import build_terrain, terrain_of_pace
-from swarm.config.load import load_scenario
+from swarm.config.toml_files import load_scenario
 
 runner = CliRunner()
 
@@ -87,13 +87,13 @@ def test_cost_of_a_class_that_flies_is_that_of_its_surface(tmp_path: Path) -> No
 def test_a_picture_of_any_shape_with_voids_and_coarsened(
     shape: tuple[int, int], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(terrain_figure, "MOST_CELLS", 1000)
+    monkeypatch.setattr(plots_and_figures, "MOST_CELLS", 1000)
     heights = np.random.default_rng(1).uniform(0, 50, shape).astype(np.float32)
     pace = np.ones(shape, np.float32)
     if heights.size > 1:
         heights[:, 0] = np.nan
         pace[0] = np.inf
-    terrain_figure.draw_terrain(terrain_of_pace(pace, 10.0, heights), tmp_path / "look.png", "any shape")
+    plots_and_figures.draw_terrain(terrain_of_pace(pace, 10.0, heights), tmp_path / "look.png", "any shape")
     assert (tmp_path / "look.png").stat().st_size > 10_000
 
 

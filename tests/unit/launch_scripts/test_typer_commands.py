@@ -20,7 +20,7 @@ from launch_scripts.check import machine_check as machine
 from launch_scripts.cli import command, main
 from launch_scripts.commands.shared_options import duration
 from launch_scripts.launcher.run_options import find_scenario
-from launch_scripts.observe.run_folder import begin_run
+from launch_scripts.observe.run_folders import begin_run
 
 
 def offered(*words: str) -> list[str]:

@@ -27,12 +27,12 @@ from launch_scripts.simulation.world.walks import (
     far_place,
     slowness_of,
 )
-from shared_map.terrain.step_climb import climb_of
+from shared_map.terrain.slope_and_climb import climb_of
 from swarm.clock import NS_PER_S
 from swarm.config.ground import CostConfig
-from swarm.config.load import parse_scenario
 from swarm.config.scenario import TargetConfig
 from swarm.config.setting_types import Walk
+from swarm.config.toml_files import parse_scenario
 from swarm.errors import ConfigError, TerrainError
 from swarm.grid import GridSpec
 from swarm.wire.messages.vehicles import Obstacle

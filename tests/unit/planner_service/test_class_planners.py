@@ -17,14 +17,14 @@ from planner_service import service as planner_service
 from planner_service.service import PlannerService
 from shared_map.cost_map import CostMap
 from shared_map.keeper.zone_orders import rows_of
-from shared_map.learning.measurements import ONE, Measurement
+from shared_map.pace_measurements import ONE, Measurement
 from shared_map.replication.replica import MapReplica
 from shared_map.terrain.terrain import Terrain, build_terrain
 from shared_map.vehicle_class_grounds import ClassMaps, class_terrains, read_by
 from swarm.bus.bus import AskEnded, Event
 from swarm.clock import NS_PER_S
-from swarm.config.load import parse_scenario
 from swarm.config.scenario import Scenario
+from swarm.config.toml_files import parse_scenario
 from swarm.grid import TILE_CELLS, walk
 from swarm.wire.messages.map_data import MarkKind
 from swarm.wire.messages.orders import Obey

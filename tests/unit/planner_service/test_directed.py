@@ -6,14 +6,14 @@ from typing import get_args
 import numpy as np
 import pytest
 
-from shared_map.terrain.step_climb import ENTRIES, Climb, climb_of
+from shared_map.terrain.slope_and_climb import ENTRIES, Climb, climb_of
 from shared_map.terrain.store import load_prepared, save_prepared
 from shared_map.terrain.synthetic import mountain_noise
 from shared_map.terrain.terrain import build_terrain
 from swarm.config.ground import CostConfig, TerrainConfig
-from swarm.config.load import parse_scenario
 from swarm.config.scenario import Scenario
 from swarm.config.setting_types import Strategy
+from swarm.config.toml_files import parse_scenario
 from swarm.errors import ConfigError
 from swarm.grid import GridSpec
 

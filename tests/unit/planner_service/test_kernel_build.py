@@ -15,8 +15,8 @@ from planner_service.kernel_build import KernelLoader, all_kernels, name_of, nee
 from planner_service.kernels.decorators import KERNELS
 from shared_map.terrain.terrain import build_terrain
 from shared_map.vehicle_class_grounds import class_terrains
-from swarm.config.load import parse_scenario
 from swarm.config.scenario import Scenario
+from swarm.config.toml_files import parse_scenario
 from swarm.config.vehicle_classes import GROUND, first_classes
 
 

@@ -16,9 +16,8 @@ from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.partial_growth import PartialGrowth
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.bus.bus import AskEnded, Event, Replied
-from swarm.config import agent_plan
-from swarm.config.agent_plan import place_job, places_of
-from swarm.config.load import parse_scenario
+from swarm.config.scenario import place_job, places_of
+from swarm.config.toml_files import parse_scenario
 from swarm.grid import walk
 from swarm.wire.messages.map_data import MarkKind
 from swarm.wire.messages.planning import PlaceRouteReply, PlaceRouteRequest, PushedRoute
@@ -272,7 +271,7 @@ def test_a_far_question_keeps_its_turn_from_all_but_nearer_ones_and_those_of_age
 
 
 def test_ten_thousand_goals_of_a_stranger_leave_memory_bounded_and_agents_first(monkeypatch):
-    monkeypatch.setattr(agent_plan, "PLACE_TREES_BYTES", 100_000)
+    monkeypatch.setattr(places.settings, "PLACE_TREES_BYTES", 100_000)
     world = PlacesWorld(flat())
     chance = random.Random(1)
     asked = [

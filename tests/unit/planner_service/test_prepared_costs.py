@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from support.planner_strategies import random_pace
 
-from planner_service.prepared_costs import PreparedCosts, prepared_costs
+from planner_service.planning_process import PreparedCosts, prepared_costs
 from planner_service.target_tree import TargetTree
 from planner_service.tree.cost_grid import CostGrid
 from shared_map.terrain.store import load_prepared, save_prepared

@@ -11,7 +11,7 @@ from support.swarm_model import SwarmModel
 from planner_service.service import PlannerService
 from shared_map.terrain.terrain import Terrain, build_terrain
 from swarm.clock import NS_PER_S
-from swarm.config.load import parse_scenario
+from swarm.config.toml_files import parse_scenario
 from swarm.grid import walk
 from swarm.wire.fields import column
 from swarm.wire.messages.planning import MOST_BELIEVED, Believed, RouteRequest, Sighted

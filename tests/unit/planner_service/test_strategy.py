@@ -30,7 +30,7 @@ from swarm.config.plugin_names import PLUGIN_KINDS, NamedPlugin
 from swarm.config.scenario import PlannerConfig
 from swarm.config.setting_types import Strategy
 from swarm.grid import GridSpec, Window
-from swarm.plugins.find import Plugin
+from swarm.plugins import Plugin
 
 GRID = GridSpec(96, 96, 1.0)
 

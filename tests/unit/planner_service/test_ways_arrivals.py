@@ -5,7 +5,7 @@ import pytest
 from support import slow_twins as naive
 from support.kernel_oracle import loaded
 
-from planner_service.search.search_places import Ways
+from planner_service.target_search import Ways
 from swarm.grid import GridSpec
 
 
@@ -20,7 +20,7 @@ def test_arrivals_are_the_cheapest_ways_out_and_the_bound_of_large_maps_is_below
     exact = 10.0 * naive.cost_to_go(pace, start, corner_cutting=True, left_share=1.0)
     ways = Ways(costs)
     np.testing.assert_allclose(ways.arrivals_s(start), exact, rtol=1e-5)
-    monkeypatch.setattr("planner_service.search.search_places._MOST_CELLS", 0)
+    monkeypatch.setattr("planner_service.target_search._MOST_CELLS", 0)
     bound = ways.arrivals_s(start)
     assert (bound <= exact * (1 + 1e-5)).all()
     assert (np.isinf(bound) == np.isinf(exact)).all()

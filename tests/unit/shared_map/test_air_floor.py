@@ -13,7 +13,7 @@ from support.effort import few
 
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
-from shared_map.terrain.air import air_ground, clearance_floor, lifted_floor
+from shared_map.vehicle_class_grounds import air_ground, clearance_floor, lifted_floor
 from swarm.config.scenario import PlannerConfig
 from swarm.config.vehicle_classes import AirConfig
 from swarm.grid import STEP_COL, STEP_ROW, GridSpec

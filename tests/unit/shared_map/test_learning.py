@@ -8,16 +8,8 @@ from msgspec.structs import replace
 from support.map_strategies import retract
 
 from shared_map.cost_map import CostMap
-from shared_map.learning.learned_factors import FACTORS, MOST_STEPS, factors_of, log_steps
-from shared_map.learning.measurements import (
-    MOST,
-    MOST_CELLS,
-    ONE,
-    Measured,
-    Measurement,
-    TrimmedMean,
-    measurements_in,
-)
+from shared_map.learned_factors import FACTORS, MOST_STEPS, factors_of, log_steps
+from shared_map.pace_measurements import MOST, MOST_CELLS, ONE, Measured, Measurement, TrimmedMean, measurements_in
 from shared_map.replication.replica import MapReplica
 from shared_map.replication.tiles import beyond_tile
 from shared_map.terrain.terrain import Terrain, terrain_of_pace

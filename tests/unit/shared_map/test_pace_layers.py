@@ -19,7 +19,7 @@ from shared_map.terrain.pace_layers import (
     terrain_pace,
 )
 from shared_map.terrain.row_bands import padded_rows
-from shared_map.terrain.slope_rules import slope_factor
+from shared_map.terrain.slope_and_climb import slope_factor
 from shared_map.terrain.terrain import build_terrain
 from shared_map.terrain.zones import paint_zones, zone_mask
 from swarm.config.ground import CostConfig, SlopeRule, TerrainConfig, ZoneConfig

@@ -14,7 +14,7 @@ from shared_map.vehicle_class_grounds import (
     load_classes,
     prepare_classes,
 )
-from swarm.config.load import parse_scenario
+from swarm.config.toml_files import parse_scenario
 from swarm.errors import TerrainError
 from swarm.runtime.role_setup import RoleSetup
 

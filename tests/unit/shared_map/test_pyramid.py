@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 
 from shared_map.terrain.pace_layers import TerrainClass
-from shared_map.terrain.pyramid import any_in_blocks, level_of
-from shared_map.terrain.terrain import terrain_of_pace
+from shared_map.terrain.terrain import any_in_blocks, level_of, terrain_of_pace
 
 
 def test_a_thin_wall_survives_every_level_and_paces_are_means_of_what_can_be_driven() -> None:

@@ -11,12 +11,18 @@ from hypothesis import strategies as st
 from support.effort import few
 
 from shared_map.terrain.pace_layers import terrain_pace
-from shared_map.terrain.slope_rules import SLOPE_RULES, directional_factor, slope_factor
-from shared_map.terrain.step_climb import ENTRIES, Climb, climb_of
+from shared_map.terrain.slope_and_climb import (
+    ENTRIES,
+    SLOPE_RULES,
+    Climb,
+    climb_of,
+    directional_factor,
+    slope_factor,
+)
 from shared_map.terrain.terrain import build_terrain
-from swarm.config.cost_rules import PRESETS, check_cost, cost_of_preset
 from swarm.config.ground import CostConfig
-from swarm.config.load import load_scenario, parse_scenario
+from swarm.config.toml_files import load_scenario, parse_scenario
+from swarm.config.vehicle_classes import PRESETS, check_cost, cost_of_preset
 from swarm.errors import ConfigError
 from swarm.grid import GridSpec
 from swarm.wire.messages.map_data import PACE_LEAST, PACE_MOST

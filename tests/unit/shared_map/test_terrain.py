@@ -23,8 +23,8 @@ from shared_map.terrain.store import (
 from shared_map.terrain.terrain import build_terrain, terrain_of_pace
 from shared_map.terrain.true_ground import build_truth
 from swarm.config.ground import CostConfig, TerrainConfig, ZoneConfig
-from swarm.config.load import load_scenario
 from swarm.config.scenario import Scenario
+from swarm.config.toml_files import load_scenario
 from swarm.errors import StoreError, TerrainError
 from swarm.runtime.role_setup import RoleSetup
 

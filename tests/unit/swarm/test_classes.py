@@ -4,11 +4,9 @@ from pathlib import Path
 
 import pytest
 
-from swarm.config.cost_rules import cost_of_preset
-from swarm.config.load import load_scenario, parse_scenario
 from swarm.config.scenario import Scenario
-from swarm.config.vehicle_classes import of_class
-from swarm.config.write import scenario_text
+from swarm.config.toml_files import load_scenario, parse_scenario, scenario_text
+from swarm.config.vehicle_classes import cost_of_preset, of_class
 from swarm.errors import ConfigError
 
 _TWO = """

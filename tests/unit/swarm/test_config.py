@@ -6,11 +6,10 @@ from typing import get_args, get_type_hints
 
 import pytest
 
-from swarm.config.agent_plan import crew_of, plan_agents
 from swarm.config.explain import meanings
-from swarm.config.load import load_scenario, parse_scenario, read_scenario
-from swarm.config.scenario import Scenario
+from swarm.config.scenario import Scenario, crew_of, plan_agents
 from swarm.config.setting_types import Section
+from swarm.config.toml_files import load_scenario, parse_scenario, read_scenario
 from swarm.errors import ConfigError
 
 

@@ -11,8 +11,8 @@ import pytest
 import planner_service.kernel_build  # noqa: F401  it watches
 from planner_service.kernels import decorators
 from planner_service.kernels.decorators import BEFORE_LOAD
-from swarm.runtime import first_use
-from swarm.runtime.first_use import FirstUseError, Modules, in_loop, note
+from swarm.runtime import loop_health
+from swarm.runtime.loop_health import FirstUseError, Modules, in_loop, note
 from swarm.runtime.stats import FIRST_USES, Counters
 
 
@@ -34,7 +34,7 @@ def test_a_loop_that_loads_a_module_fails_in_tests_and_one_that_uses_a_loaded_on
 
 
 def test_a_live_loop_that_loads_a_module_counts_and_logs_it(module, monkeypatch, caplog):
-    monkeypatch.setattr(first_use, "refused", False)
+    monkeypatch.setattr(loop_health, "refused", False)
     counters = Counters()
     with in_loop(counters):
         __import__(module)

@@ -8,8 +8,7 @@ import pytest
 from swarm.bus.bus import Asked, AskEnded, Heard, Replied
 from swarm.clock import NS_PER_S
 from swarm.config.scenario import Scenario
-from swarm.runtime.order_book import GoalBook
-from swarm.runtime.order_client import OrderClient
+from swarm.runtime.order_book import GoalBook, OrderClient
 from swarm.runtime.role_setup import RoleSetup
 from swarm.wire.messages import Nothing
 from swarm.wire.messages.orders import Goals, Obey, Order, Orders, VehicleGoals

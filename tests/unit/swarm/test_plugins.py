@@ -16,11 +16,20 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support.plugin_modules import forgotten_afterwards
 
-from swarm.config.load import load_scenario, parse_scenario
 from swarm.config.plugin_names import PLUGIN_KINDS, NamedPlugin
+from swarm.config.toml_files import load_scenario, parse_scenario
 from swarm.errors import ConfigError
-from swarm.plugins.find import Plugin, check_plugins, find_plugin, named_plugin
-from swarm.plugins.guard import KILLED_BY, Guard, Hangs, Nonsense, call_within
+from swarm.plugins import (
+    KILLED_BY,
+    Guard,
+    Hangs,
+    Nonsense,
+    Plugin,
+    call_within,
+    check_plugins,
+    find_plugin,
+    named_plugin,
+)
 
 MODULE = """
 import msgspec
@@ -228,7 +237,7 @@ def test_a_call_that_no_alarm_ends_kills_the_process_and_leaves_its_line(hangs: 
         "import time\n"
         "from contextlib import suppress\n"
         "from itertools import repeat\n"
-        "from swarm.plugins.guard import call_within\n"
+        "from swarm.plugins import call_within\n"
         "def look():\n"
         f"    {hangs}\n"
         "call_within(0.1, look)\n"

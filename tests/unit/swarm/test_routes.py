@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from support.makers import route_reply
 from support.wire_strategies import routes
 
-from planner_service.kernels import route_walk
+from planner_service.kernels import route_kernels
 from swarm.errors import ProtocolError
 from swarm.wire import route_columns as named
 from swarm.wire.codec import decode, encode
@@ -79,8 +79,8 @@ def test_the_gap_of_a_batch_is_infinite_where_nothing_is_proven() -> None:
 
 def test_kernels_and_columns_number_statuses_alike() -> None:
     for name in ("OK", "UNREACHABLE", "OUTSIDE", "LETHAL_START"):
-        assert getattr(route_walk, name) == getattr(named, name)
-        assert STATUSES[getattr(route_walk, name)].name == name
+        assert getattr(route_kernels, name) == getattr(named, name)
+        assert STATUSES[getattr(route_kernels, name)].name == name
 
 
 COLUMNS = RouteBatch.of([Route(status=RouteStatus.OK, start=5, cost_s=1.0, directions=b"\x01\x02")]).columns()

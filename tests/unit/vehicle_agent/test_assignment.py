@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from swarm.config.plugin_names import PLUGIN_KINDS, NamedPlugin
 from swarm.grid import GridSpec
-from swarm.plugins.find import Plugin
+from swarm.plugins import Plugin
 from vehicle_agent.assignment import ASSIGNERS, HYSTERESIS, AssignmentWorld, CostTable, assigner_of, spread
 from vehicle_agent.driving.driven_vehicle import Vehicle
 from vehicle_agent.target_choice import Assignment

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from swarm.config.plugin_names import PLUGIN_KINDS, NamedPlugin
 from swarm.config.vehicle_classes import ClassConfig
 from swarm.grid import GridSpec
-from swarm.plugins.find import Plugin
+from swarm.plugins import Plugin
 from vehicle_agent.driving.dynamics import DynamicsWorld, PluginDynamics, Stretch, dynamics_of, own_dynamics
 from vehicle_agent.driving.motion import Motion
 

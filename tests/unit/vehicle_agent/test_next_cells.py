@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from support.effort import few
 
 from planner_service.target_tree import TargetTree
-from shared_map.terrain.step_climb import Climb, climb_of
+from shared_map.terrain.slope_and_climb import Climb, climb_of
 from swarm.config.ground import CostConfig
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec, walk

@@ -9,7 +9,7 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from shared_map.terrain.step_climb import climb_of
+from shared_map.terrain.slope_and_climb import climb_of
 from swarm.clock import NS_PER_S
 from swarm.config.ground import CostConfig
 from swarm.config.scenario import PlannerConfig

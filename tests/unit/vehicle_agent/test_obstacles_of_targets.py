@@ -5,7 +5,7 @@ import math
 import pytest
 
 from swarm.clock import NS_PER_S
-from swarm.config.load import parse_scenario
+from swarm.config.toml_files import parse_scenario
 from swarm.errors import ConfigError
 from swarm.grid import GridSpec
 from swarm.wire.messages.planning import TargetPose

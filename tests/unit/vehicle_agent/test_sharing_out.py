@@ -15,7 +15,7 @@ from swarm.clock import NS_PER_S
 from swarm.config.plugin_names import PLUGIN_KINDS, NamedPlugin
 from swarm.errors import ProtocolError
 from swarm.grid import GridSpec
-from swarm.plugins.find import Plugin
+from swarm.plugins import Plugin
 from swarm.wire.codec import decode, encode
 from swarm.wire.fields import pack_column
 from swarm.wire.messages.vehicles import MOST_SHARED_TARGETS, NO_TARGET, SharedCosts
