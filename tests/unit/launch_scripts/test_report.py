@@ -72,6 +72,9 @@ def test_the_report_has_every_number_that_was_asked_for(left: tuple[Path, Record
     assert verdict(worse, ["agent-a0 did not end"]).endswith(
         "1 collision. Not all went well: agent-a0 did not end; collisions 1; 2 of 10 vehicles lost at the end."
     )
+    slow = {**worse, "ticks": 1000, "ticks_late": 201}
+    assert ". Not all went well: overloaded machine, 20% of ticks were late; collisions 1" in verdict(slow)
+    assert "overloaded" not in verdict({**slow, "ticks_late": 200})
     assert set(report["gap"]) == {"mean", "p95", "max"}
     assert set(report["growth_ms"]) == {"p50", "p99"}
     assert len(report["series"]["t_s"]) == len(report["series"]["captures"]) >= 10
