@@ -34,8 +34,7 @@ if TYPE_CHECKING:
 app = typer.Typer()
 
 RunArgument = Annotated[
-    str | None,
-    typer.Argument(metavar="RUN", envvar="SWARM_RUN", show_envvar=False, autocompletion=complete_runs),
+    str | None, typer.Argument(metavar="RUN", envvar="SWARM_RUN", show_envvar=False, autocompletion=complete_runs)
 ]
 _DOWN_S = 120.0
 """A launcher that is asked to end gives each role five seconds, then writes its report."""

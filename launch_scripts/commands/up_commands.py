@@ -72,10 +72,7 @@ class SomeProcesses:
     """
 
     panel: ClassVar[str | None] = PART
-    only: Annotated[
-        list[str] | None,
-        typer.Option(metavar="ROLE[.ID]"),
-    ] = None
+    only: Annotated[list[str] | None, typer.Option(metavar="ROLE[.ID]")] = None
     rank: Annotated[int | None, typer.Option(min=0, max=HIGHEST_RANK)] = None
     run_id: str | None = None
     take_over: bool = False

@@ -26,7 +26,6 @@ from launch_scripts.launcher.ordered_planners import OrderedPlanners, with_targe
 from launch_scripts.launcher.takeover import TakeOver
 from launch_scripts.launcher.terminal_tables import live_table, plain_line
 from launch_scripts.launcher.watcher import OwnPart, Watcher, check_vacant
-from launch_scripts.observe import fact_table as facts
 from launch_scripts.observe.latest_messages import plan_of_members
 from launch_scripts.observe.local_runs import LAUNCHER_LOG, register
 from launch_scripts.observe.recorder import Recorder
