@@ -211,7 +211,7 @@ class _Run:
         if self._startup_s is None and not self._stop_asked:
             missing = ", ".join(self._missing(watcher)) or "routes"
             busy = f"load {os.getloadavg()[0]:.0f} on {len(os.sched_getaffinity(0))} cores"
-            failures.append(f"the swarm was never whole: missing {missing} ({busy})")
+            failures.insert(0, f"the swarm was never whole: missing {missing} ({busy})")
         has_run = isinstance(known, OwnPart) or known.routed or not failures
         code = self._end(known, seconds, failures) if has_run else 0
         for failure in failures:
