@@ -91,9 +91,8 @@ def shorten_types(command: Any, ctx: Any) -> None:
     rich_utils.RANGE_STRING = ""
     for each in command.get_params(ctx):
         if each.param_type_name == "option":
-            each.metavar = (
-                "" if each.is_flag else each.metavar or re.sub(r" range|list\[|\]", "", each.display_type(ctx))
-            )
+            shown = re.sub(r" range|list\[|\]", "", each.display_type(ctx))
+            each.metavar = "" if each.is_flag else each.metavar or shown
 
 
 def family_app(help: str) -> typer.Typer:
