@@ -64,6 +64,7 @@ class Root(TyperGroup):
     def format_help(self, ctx: Any, formatter: Any) -> None:
         """Prints the text above, with the names of all other commands, unless `swarm help --all` is asked for."""
         if self.all:
+            typer_commands.shorten_types(self, ctx)
             super().format_help(ctx, formatter)
             return
         text = inspect.cleandoc(Root.__doc__ or "")

@@ -28,7 +28,7 @@ from pathlib import Path
 from typing import Annotated, Any, TypeVar, get_type_hints
 
 import typer
-from typer.core import TyperGroup
+from typer.core import TyperCommand, TyperGroup
 from typer.exceptions import TyperException
 
 from launch_scripts.plain_text import plain
@@ -68,11 +68,31 @@ def command(
     """
 
     def added(function: F) -> F:
-        made = app.command(name, rich_help_panel=panel, help=_prose(function.__doc__), **settings)
+        made = app.command(name, cls=Command, rich_help_panel=panel, help=_prose(function.__doc__), **settings)
         made(_called_with_options(function))
         return function
 
     return added
+
+
+class Command(TyperCommand):
+    """A command whose help has short types."""
+
+    def format_help(self, ctx: Any, formatter: Any) -> None:
+        shorten_types(self, ctx)
+        super().format_help(ctx, formatter)
+
+
+def shorten_types(command: Any, ctx: Any) -> None:
+    """Leaves bounds and the type of flags out of a command's help: at 80 columns they break words and press the
+    meanings together. The sentence about a wrong number names its bounds, as does the reference page."""
+    from typer import rich_utils
+
+    rich_utils.RANGE_STRING = ""
+    for each in command.get_params(ctx):
+        if each.param_type_name == "option":
+            shown = re.sub(r" range|list\[|\]", "", each.display_type(ctx))
+            each.metavar = "" if each.is_flag else each.metavar or shown
 
 
 def family_app(help: str) -> typer.Typer:
@@ -163,6 +183,7 @@ class Family(TyperGroup):
         """Typer gives a new group the commands that it knows, and of a family it knows none."""
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
+        shorten_types(self.group, ctx)
         self.group.format_help(ctx, formatter)
 
 
@@ -208,6 +229,7 @@ _SYNONYMS = {
     "list": ("ls", "ps"), "ls": ("ps",), "init": ("new",), "create": ("new", "add"), "version": ("--version",),
     "delete": ("remove",), "rm": ("remove",), "plan": ("deploy plan",), "terrain route": ("swarm route --terrain",),
     "dem": ("terrain info",), "watch": ("top",), "validate": ("check",), "sweep": ("study run",),
+    **{name: (f"role {name}",) for name in ("router", "keeper", "planner", "places", "agent", "monitor")},
     "bench": ("./launch_scripts/bench of a checkout",), "chaos": ("./launch_scripts/bench chaos of a checkout",),
 }  # fmt: skip
 """Word that other programs have, or we had, perhaps after its group -> our words, the first of which that a group
@@ -285,7 +307,8 @@ def _sentence(error: TyperException) -> str:
         said = said.removesuffix(".") + _meant(unknown[1], ctx)
     elif option := getattr(error, "option_name", None) if said.startswith("No such option") else None:
         names = [name for each in ctx.command.params for name in each.opts]
-        said = f"No such option: {option}{nearest(option, names)}"
+        there = _elsewhere(option, ctx)
+        said = f"No such option: {option}{_asked(there) if there else nearest(option, names)}"
     for before, word in pairwise(sys.argv):
         if re.fullmatch(r"\S*\d,", before) and re.fullmatch(r"[-+.\d]+", word):
             return f"{said.removesuffix('.')}; a place has no blank: did you mean '{before}{word}'?"
@@ -303,17 +326,27 @@ def _meant(word: str, ctx: Any) -> str:
     words = _SYNONYMS.get(f"{ctx.info_name} {word}", _SYNONYMS.get(word, file))
     meant = [each for each in words if each.split()[0] in {"swarm", *known} or each[0] in "-."][:1]
     if not meant and singular not in known:
-        same = re.compile(rf" {re.escape(singular)}s?$")
-        meant = [each for each in _paths(ctx.find_root().command) if same.search(each)]
-    said = f"; did you mean {' or '.join(map(repr, meant))}?"
-    return said if len(meant) in (1, 2, 3) else choice(word, list(known), " there are: ")
+        meant = _elsewhere(singular, ctx)
+    return _asked(meant) or choice(word, list(known), " there are: ")
 
 
-def _paths(group: Any, before: str = "swarm") -> Iterator[str]:
-    """Yields the words of each command of a group and of the groups in it."""
-    for name, command in getattr(group, "commands", {}).items():
-        yield f"{before} {name}"
-        yield from _paths(command, f"{before} {name}")
+def _asked(meant: list[str]) -> str:
+    """Returns the question whether a few words are meant; empty if there are none, or too many to guess."""
+    return f"; did you mean {' or '.join(map(repr, meant))}?" if len(meant) in (1, 2, 3) else ""
+
+
+def _elsewhere(word: str, ctx: Any) -> list[str]:
+    """Returns all commands, and options of commands, which have this name or its plural."""
+    same = re.compile(rf" {re.escape(word)}s?$")
+    return [each for each in _paths(ctx.find_root().command) if same.search(each)]
+
+
+def _paths(command: Any, words: str = "swarm") -> Iterator[str]:
+    """Yields the words of a command, also with each of its options, and those of the commands in it."""
+    yield words
+    yield from (f"{words} {option}" for each in command.params for option in each.opts)
+    for name, each in getattr(command, "commands", {}).items():
+        yield from _paths(each, f"{words} {name}")
 
 
 def _fill_streams() -> None:

@@ -95,10 +95,7 @@ class SomeProcesses:
     """
 
     panel: ClassVar[str | None] = PART
-    only: Annotated[
-        list[str] | None,
-        typer.Option(metavar="ROLE[.ID]"),
-    ] = None
+    only: Annotated[list[str] | None, typer.Option(metavar="ROLE[.ID]")] = None
     rank: Annotated[int | None, typer.Option(min=0, max=HIGHEST_RANK)] = None
     run_id: str | None = None
     take_over: bool = False
@@ -183,8 +180,7 @@ def _began_s() -> float:
 
 
 RunArgument = Annotated[
-    str | None,
-    typer.Argument(metavar="RUN", envvar="SWARM_RUN", show_envvar=False, autocompletion=complete_runs),
+    str | None, typer.Argument(metavar="RUN", envvar="SWARM_RUN", show_envvar=False, autocompletion=complete_runs)
 ]
 _DOWN_S = 120.0
 """A launcher that is asked to end gives each role five seconds, then writes its report."""

@@ -125,16 +125,14 @@ def layers_of(route: DescribedRoute, ending: str) -> list[gis_formats.Layer]:
         columns["height_m"] = route.height_m.round(2)
     columns |= steps
     told = zip(*(column.tolist() for column in columns.values()), strict=True)
-    cells = gis_formats.Layer(
-        "route_cells",
-        "Point",
-        {name: "int" if name in ("row", "col") else "real" for name in columns},
-        [
-            gis_formats.Feature([place], dict(zip(columns, each, strict=True)))
-            for place, each in zip(xy_m[:, None, :2], told, strict=True)
-        ],
-        gis_formats.COSTS,
-    )
+    points = [
+        gis_formats.Feature([place], dict(zip(columns, each, strict=True)))
+        for place, each in zip(xy_m[:, None, :2], told, strict=True)
+    ]
+    types: dict[str, gis_formats.FieldKind] = {
+        name: "int" if name in ("row", "col") else "real" for name in columns
+    }
+    cells = gis_formats.Layer("route_cells", "Point", types, points, gis_formats.COSTS)
     return [cells] if ending == ".csv" else [line, cells]
 
 

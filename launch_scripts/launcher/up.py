@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import logging
 import math
+import os
 import shutil
 import time
 from collections import Counter
@@ -23,7 +24,6 @@ from launch_scripts.launcher.log_file import JsonLines, Speaker, log_to
 from launch_scripts.launcher.ordered_planners import OrderedPlanners, with_target
 from launch_scripts.launcher.takeover import TakeOver
 from launch_scripts.launcher.watcher import LauncherHealth, OwnPart, Watcher, check_vacant
-from launch_scripts.observe import run_state as facts
 from launch_scripts.observe.latest_messages import plan_of_members
 from launch_scripts.observe.recorder import Recorder
 from launch_scripts.observe.run_folders import LAUNCHER_LOG, REPORT_FILE, DiskWatch, begin_run, register
@@ -44,7 +44,7 @@ from swarm.bus.endpoints import listening
 from swarm.bus.zenoh_bus import open_bus
 from swarm.clock import MonotonicClock, date_ns
 from swarm.config.scenario import UNTIL_STOPPED_S
-from swarm.errors import BusError, StoreError, SwarmError
+from swarm.errors import BusError, StoreError, SwarmError, require
 from swarm.peers import Peer, job_of
 from swarm.plugins import check_plugins
 from swarm.runtime.membership import check_belongs
@@ -74,6 +74,8 @@ def run_swarm(options: run_options.UpOptions) -> int:
     for spec in options.table:
         run_options.as_process(options.scenario, spec.role, spec.id)  # raises where its certificate is missing
     check_plugins(options.scenario, options.roles)
+    if "monitor" in options.roles:
+        require("the monitor", "rerun")
     if not options.joins and not options.takes_over:
         check_ports(options.scenario, options.roles, (options.signals_address, options.metrics_port or 0))
     run_id, started_ns = _run_id_of(options)
@@ -205,7 +207,8 @@ class _Run:
             self._swarm.kill()
         if self._startup_s is None and not self._stop_asked:
             missing = ", ".join(self._missing(watcher)) or "routes"
-            failures.append(f"the swarm was never whole: missing {missing}")
+            busy = f"load {os.getloadavg()[0]:.0f} on {len(os.sched_getaffinity(0))} cores"
+            failures.insert(0, f"the swarm was never whole: missing {missing} ({busy})")
         has_run = isinstance(known, OwnPart) or known.routed or not failures
         code = self._end(known, seconds, failures) if has_run else 0
         for failure in failures:
@@ -372,13 +375,14 @@ class _Run:
         register(self._run_dir, web_port=self._web_port, is_whole=self._startup_s is not None)
 
     def _show(self, known: Recorder | OwnPart, now_ns: int, missing: list[str]) -> None:
+        up = f"{len(self._swarm.running) - len(missing)} of {len(self._swarm.running)}"
         if isinstance(known, OwnPart):
-            title = self._title(f"{known.well} of this machine's", missing)
+            title = self._title(up, missing)
             self._terminal.show(lambda: known.line(title, now_ns, self._swarm.restarts))
             return
         state = known.summary(now_ns)
         missing = missing or [number_of(all - up, role) for role, (up, all) in state.crew.items() if up < all]
-        title = self._title(f"{facts.fact('processes_well').shown(state)} needed", missing)
+        title = self._title(up, missing)
         self._terminal.show(lambda: plain_line(state, title), lambda console: live_table(state, title, console))
 
     def _title(self, up: str, missing: list[str]) -> str:
@@ -387,7 +391,7 @@ class _Run:
         since_s = time.monotonic() - self._options.began_s - (self._startup_s or 0.0)
         if self._startup_s is None:
             waits = f", waits for {', '.join(missing) or 'the first route'}" * (len(missing) < 4)
-            return f"{self._scenario.name}: starting, {up} processes are up{waits}, {since_s:.0f} s"
+            return f"{self._scenario.name}: starting, {up} processes started here are up{waits}, {since_s:.0f} s"
         of = "" if self._outlasts else self._limit(" of")
         until = ", until the live view is closed, or Ctrl-C" if self._outlasts else ""
         live = f"{until}, page {page_of(self._web_port)}" if self._web_port else ""

@@ -69,11 +69,6 @@ class OwnPart(LatestState):
         own = {(spec.role, spec.id) for spec in self.own}
         return [key for key in self.up() if key in own]
 
-    @property
-    def well(self) -> str:
-        """Returns the number of living processes, in words."""
-        return f"{len(self.own_up())} of {len(self.own)}"
-
     def own_alarms(self, now_ns: int) -> list[str]:
         """Returns their alarms, in lines for people."""
         lasting = [alarm for alarm in alarms_of(self, self.plan.targets, now_ns) if alarm.lasts]
@@ -82,7 +77,7 @@ class OwnPart(LatestState):
     def line(self, title: str, now_ns: int, restarts: int) -> str:
         """All of it in one line."""
         alarms = "".join(f"; {line}" for line in self.own_alarms(now_ns))
-        return f"{title}: processes {self.well}, restarts {restarts}{alarms}"
+        return f"{title}: processes {len(self.own_up())} of {len(self.own)}, restarts {restarts}{alarms}"
 
 
 class Watcher(RunObserver):

@@ -300,12 +300,7 @@ class MoversView:
     """
 
     def __init__(
-        self,
-        pen: Pen,
-        scenario: Scenario,
-        observed: LatestState,
-        counters: Counters,
-        filter: MarkFilter,
+        self, pen: Pen, scenario: Scenario, observed: LatestState, counters: Counters, filter: MarkFilter
     ) -> None:
         self._pen, self._mesh, self._observed, self._counters = pen, pen.mesh, observed, counters
         self._level = level = styles.level_for(scenario.vehicle_count)

@@ -20,10 +20,7 @@ from swarm.wire.messages.vehicles import VehicleState
 Shape = Literal["ball", "ring", "line", "fill", "hatch"]
 
 HUES: tuple[Colour, ...] = tuple(
-    map(
-        palette.rgb,
-        (palette.SKY, palette.ORANGE, "#F0E442", palette.PINK, palette.GREEN, "#E8601C", "#0F6FC6"),
-    )
+    map(palette.rgb, (palette.SKY, palette.ORANGE, "#F0E442", palette.PINK, palette.GREEN, "#E8601C", "#0F6FC6"))
 )
 """In turn for groups, or targets. Blue and vermilion are lighter than theirs: the ground is dark."""
 NOBODY: Colour = (170, 176, 182)

@@ -428,6 +428,7 @@ class Recorder:
             "tracking": observed.tracking(),
             "stranded": state.states["stranded"] if observed.fleet_ns is not None else None,
             "lost": state.states["lost"] if observed.fleet_ns is not None else None,
+            "ticks": observed.histogram("tick_ms").count + (observed.total("ticks_dropped") or 0),
             "marked_cells": len(observed.marked().cells) or None,
             **{name: observed.total(name) for name in _TOTALS},
             "gap": gap if self._gap_max is None else {**gap, "max": self._gap_max},

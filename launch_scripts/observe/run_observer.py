@@ -161,12 +161,7 @@ class OutsideObserver(RunObserver):
     """
 
     def __init__(
-        self,
-        bus: Bus,
-        post: Post | None = None,
-        topics: Mapping[Topic, float] = HEARD,
-        *,
-        follows: bool = False,
+        self, bus: Bus, post: Post | None = None, topics: Mapping[Topic, float] = HEARD, *, follows: bool = False
     ) -> None:
         self._inbox = Inbox()
         super().__init__(bus, post or self._inbox.post, self, topics)

@@ -6,6 +6,7 @@ everywhere.
 
 from __future__ import annotations
 
+import math
 from collections import Counter
 from collections.abc import Callable, Collection, Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -469,6 +470,8 @@ def verdict(report: Mapping[str, Any], failures: Sequence[str] = ()) -> str:
     """The outcome of a run: what it reached, and whether all went well or what did not, from its report.
 
     failures  what its launcher says of processes, in sentences without a full stop
+
+    An overload comes first: it explains the other faults.
     """
     captures, collisions = report.get("captures"), report.get("collisions")
     reached = [f"{count(report.get('vehicles_routed') or 0)} of {count(report['vehicles'])} vehicles routed"]
@@ -480,7 +483,9 @@ def verdict(report: Mapping[str, Any], failures: Sequence[str] = ()) -> str:
         for alarm in report.get("alarms") or []
         if alarm["kind"] in SERIOUS and (alarm["over_s"] is None or alarm["kind"] == "silent")
     ]
-    wrong = list(dict.fromkeys([*failures, *forbidden, *serious, *left_behind(report)]))
+    late = (report.get("ticks_late") or 0) / (report.get("ticks") or math.inf)
+    overload = [f"overloaded machine, {late:.0%} of ticks were late"] if late > _LATE_SHARE else []
+    wrong = list(dict.fromkeys([*overload, *failures, *forbidden, *serious, *left_behind(report)]))
     more = f"; and {len(wrong) - _FAULTS} more" if len(wrong) > _FAULTS else ""
     how = f"Not all went well: {'; '.join(wrong[:_FAULTS])}{more}." if wrong else WELL
     return f"{', '.join(reached)}. {how}"
@@ -488,4 +493,6 @@ def verdict(report: Mapping[str, Any], failures: Sequence[str] = ()) -> str:
 
 _FAULTS = 3
 """Most faults that a verdict names."""
+_LATE_SHARE = 0.2
+"""Share of late ticks from which on a run is overloaded, as in the alert `SwarmTicksLate`."""
 WELL = "All went well."

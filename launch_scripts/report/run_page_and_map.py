@@ -166,9 +166,11 @@ def _draw_track(
 
 
 def _label(axes: Axes, text: str, x: float, y: float, width_km: float) -> None:
-    """Annotates beside the place, on the side where the text fits, and below it at the upper border."""
-    side = 1 if x < 0.94 * width_km else -1
-    below = y < 0.04 * axes.get_ylim()[0]
+    """Annotates beside the place, on the side where the text fits; below it at the upper border, and beside another
+    label."""
+    side, others = 1 if x < 0.94 * width_km else -1, list[Any](axes.texts)
+    beside = any(np.hypot(*np.subtract(each.xy, (x, y))) < 0.05 * width_km for each in others)
+    below = beside or y < 0.04 * axes.get_ylim()[0]
     axes.annotate(
         text, (x, y), xytext=(6 * side, -6 if below else 5), textcoords="offset points", fontsize=9,
         fontweight="bold", color=palette.RED, zorder=10, path_effects=halo(), ha="left" if side > 0 else "right",

@@ -66,11 +66,7 @@ def code_version() -> str:
     return digest.hexdigest()
 
 
-LAWS = {
-    "collisions": "no collision",
-    "lethal_entries": "no lethal entry",
-    "driven_into": "obstacles are avoided",
-}
+LAWS = {"collisions": "no collision", "lethal_entries": "no lethal entry", "driven_into": "obstacles are avoided"}
 """Figure of a report that must be 0 -> the law. Outcomes of trials without faults."""
 _LEFT_OUT = ("by_vehicle", "seed")
 

@@ -127,13 +127,7 @@ class Server(socketserver.ThreadingTCPServer):
     request_queue_size = 4 * MOST_CONNECTIONS
 
     def __init__(
-        self,
-        what: str,
-        port: int,
-        pages: Mapping[str, Page],
-        address: str = LOOPBACK,
-        *,
-        lasts_s: float = 10.0,
+        self, what: str, port: int, pages: Mapping[str, Page], address: str = LOOPBACK, *, lasts_s: float = 10.0
     ) -> None:
         self.pages, self.lasts_s = pages, lasts_s
         self.behind: tuple[str, int] | None = None

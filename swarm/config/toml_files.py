@@ -74,8 +74,8 @@ def read_scenario(
     most: int = 50,
     settings: Mapping[str, Any] | None = None,
 ) -> tuple[Scenario | None, list[str]]:
-    """Returns the scenario of a text and its faults, up to a limit of sentences. None where not all keys could be
-    read.
+    """Returns the scenario of a text and its faults, up to a limit of sentences. A key that could not be read has
+    its default; None if that is not enough.
 
     settings  dotted key -> value, instead of what the text says (`with_settings`)
     """
@@ -99,8 +99,8 @@ def read_scenario(
             taken_out.add(place)
             if not _take_out(raw, place):
                 break
-    if scenario is None or faults:
-        return None, faults
+    if scenario is None or faults:  # what is left names its files, whatever the rest is
+        return None if scenario is None else anchored(scenario, base or Path()), faults
     scenario = msgspec.convert(complete_costs(raw), Scenario)  # only now, so that a fault of [cost] is one fault
     try:
         classes = tuple(

@@ -94,9 +94,7 @@ def network(folder: Path) -> NetworkConfig:
     return NetworkConfig(tls=tls, revoked=("agent.all.a9",))
 
 
-def test_names_are_added_once_in_order_and_a_router_denies_them_and_those_of_its_scenario(
-    tmp_path: Path,
-) -> None:
+def test_names_are_added_once_in_order_and_a_router_denies_them_and_those_of_its_scenario(tmp_path: Path) -> None:
     assert with_revocations(network(tmp_path)) == network(tmp_path)
     revoke(tmp_path, ["agent.all.a1", "agent.all.a0~2"])
     revoke(tmp_path, ["agent.all.a1", "keeper.0", "agent.all.a9"])
@@ -122,9 +120,7 @@ def test_a_file_that_is_no_list_of_names_is_refused(tmp_path: Path, content: byt
         with_revocations(network(tmp_path))
 
 
-def test_what_cannot_be_read_or_written_is_named_and_a_wrong_name_changes_nothing(
-    tmp_path: Path,
-) -> None:
+def test_what_cannot_be_read_or_written_is_named_and_a_wrong_name_changes_nothing(tmp_path: Path) -> None:
     revoke(tmp_path, ["keeper.0"])
     with pytest.raises(ConfigError, match=r"'a b' is no name in a certificate, such as agent\.all\.a0~2$"):
         revoke(tmp_path, ["keeper.1", "a b"])

@@ -139,9 +139,7 @@ def test_programs_get_the_way_in_metres_and_degrees(tmp_path: Path) -> None:
         write(answer(RouteStatus.UNREACHABLE), tmp_path / "none.csv")
 
 
-def test_of_a_search_the_place_to_look_at_is_told_and_the_last_sighting(
-    capsys: pytest.CaptureFixture[str],
-) -> None:
+def test_of_a_search_the_place_to_look_at_is_told_and_the_last_sighting(capsys: pytest.CaptureFixture[str]) -> None:
     seen = answer(RouteStatus.SEARCHING, GRID.cell(50, 70), **{**WAY, "lower_bound_s": 0.0})
     fields = json.loads(as_json(seen))
     assert fields["searching"] is True

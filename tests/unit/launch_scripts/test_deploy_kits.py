@@ -164,9 +164,7 @@ def test_no_archive_outside_of_the_folder_is_removed(tmp_path: Path) -> None:
     assert (tmp_path / "mine.tar.gz").exists()
 
 
-def test_a_machine_reads_the_plans_scenario_with_its_own_endpoints_and_starts_its_processes(
-    tmp_path: Path,
-) -> None:
+def test_a_machine_reads_the_plans_scenario_with_its_own_endpoints_and_starts_its_processes(tmp_path: Path) -> None:
     plan = planned()
     for host, folder in zip(plan.hosts, unpacked(plan, tmp_path), strict=True):
         scenario = load_scenario(folder / "scenario.toml")
@@ -182,9 +180,7 @@ def test_a_machine_reads_the_plans_scenario_with_its_own_endpoints_and_starts_it
         assert started == [(process.role, process.id) for process in host.processes]
 
 
-def test_terrain_files_go_to_keepers_and_the_targets_process_with_all_that_belongs_to_them(
-    tmp_path: Path,
-) -> None:
+def test_terrain_files_go_to_keepers_and_the_targets_process_with_all_that_belongs_to_them(tmp_path: Path) -> None:
     own = lay_ground(tmp_path)
     plan = planned(ON_GROUND, base=tmp_path)
     folders = unpacked(plan, tmp_path / "kits")

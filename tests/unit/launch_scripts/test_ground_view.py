@@ -117,9 +117,7 @@ def test_what_is_hidden_what_is_found_and_what_is_said_wrongly_have_colours_of_t
 
 
 @given(st.lists(st.tuples(st.integers(0, 39), st.integers(0, 49)), min_size=1, max_size=30))
-def test_a_border_lies_between_inside_and_outside_and_nowhere_else(
-    cells: list[tuple[int, int]],
-) -> None:
+def test_a_border_lies_between_inside_and_outside_and_nowhere_else(cells: list[tuple[int, int]]) -> None:
     inside = np.zeros((40, 50), np.bool_)
     inside[tuple(np.array(cells).T)] = True
     mesh = TerrainMesh(flat())

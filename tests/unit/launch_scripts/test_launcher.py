@@ -26,10 +26,7 @@ from planner_service.kernel_build import name_of, needed_kernels, place_kernels
 from swarm.config.scenario import Scenario
 
 # Marked as network tests, like those: its tests wait for processes.
-pytestmark = [
-    pytest.mark.network,
-    pytest.mark.skipif(sys.platform != "linux", reason="reads /proc"),
-]
+pytestmark = [pytest.mark.network, pytest.mark.skipif(sys.platform != "linux", reason="reads /proc")]
 
 
 @pytest.fixture

@@ -10,6 +10,7 @@ import shlex
 import socket
 import sys
 import tomllib
+from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NoReturn
 
@@ -52,6 +53,11 @@ def port_taken(folder: Path, request: pytest.FixtureRequest) -> None:
     endpoint = f"tcp/127.0.0.1:{taken.getsockname()[1]}"
     path = folder / "tiny.toml"
     path.write_text(f'{TINY}[network]\nlisten = ["{endpoint}"]\nconnect = ["{endpoint}"]\n')
+
+
+def no_viewer(folder: Path, request: pytest.FixtureRequest) -> None:
+    patch = request.getfixturevalue("monkeypatch")
+    patch.setattr("swarm.errors.find_spec", lambda name: None if name == "rerun" else find_spec(name))
 
 
 def two_machines(folder: Path, request: pytest.FixtureRequest) -> None:

@@ -15,7 +15,7 @@ from support.command import Swarm
 
 from launch_scripts import ports
 from launch_scripts.check import machine_check as machine
-from launch_scripts.check.scenario_check import not_made, one_way_share, places, shards
+from launch_scripts.check.scenario_check import files_named, not_made, one_way_share, places, shards
 from launch_scripts.simulation.world.walks import TrueTerrain
 from shared_map.terrain.terrain import terrain_of_pace
 from shared_map.vehicle_class_grounds import class_grounds
@@ -168,11 +168,12 @@ def test_more_shards_than_agents_have_use_for_are_a_warning_with_what_to_set() -
     assert list(shards(parse_scenario(text), GridSpec(512, 512, 20.0))) == []
 
 
-def test_all_keys_that_are_wrong_are_named_each_once() -> None:
+def test_all_keys_that_are_wrong_are_named_each_once_and_missing_files_beside_them() -> None:
     text = """
 seed = -1
 secnds = 3
 [terrain]
+source = "none.tif"
 rodes = 4
 [[cost.zones]]
 kind = "forbiden"
@@ -186,7 +187,8 @@ vehicles = 1.5
 start = "heap"
 """
     scenario, faults = read_scenario(text, "s.toml")
-    assert scenario is None
+    assert scenario is not None
+    assert [each.about for each in files_named(scenario)] == ["terrain.source"]
     keys = ["seed", "secnds", "terrain.rodes", "cost.zones[0].kind", "groups[0].vehicles", "groups[1].vehicles"]
     assert len(faults) == 7
     for key, fault in zip([*keys, "groups[1].start"], faults, strict=True):

@@ -71,6 +71,9 @@ def test_the_report_has_every_number_that_was_asked_for(left: tuple[Path, Record
     assert verdict(worse, ["agent-a0 did not end"]).endswith(
         "1 collision. Not all went well: agent-a0 did not end; collisions 1; 2 of 10 vehicles lost at the end."
     )
+    slow = {**worse, "ticks": 1000, "ticks_late": 201}
+    assert ". Not all went well: overloaded machine, 20% of ticks were late; collisions 1" in verdict(slow)
+    assert "overloaded" not in verdict({**slow, "ticks_late": 200})
     assert set(report["gap"]) == {"mean", "p95", "max"}
     assert set(report["growth_ms"]) == {"p50", "p99"}
     assert len(report["series"]["t_s"]) == len(report["series"]["captures"]) >= 10
@@ -83,13 +86,18 @@ def test_the_report_has_every_number_that_was_asked_for(left: tuple[Path, Record
     ]  # fmt: skip
 
 
-def test_a_target_at_the_upper_border_has_its_name_below_it_also_without_marks(left: tuple[Path, Recorder]) -> None:
+def test_names_of_targets_at_the_upper_border_or_beside_each_other_do_not_overlap_also_without_marks(
+    left: tuple[Path, Recorder],
+) -> None:
     tracks = read_tracks(left[0] / "tracks.npz")
-    top = dataclasses.replace(tracks.vehicles[0], xy_m=np.array([[9.0, -1.0]]))
+    ends = [[9.0, -1.0], [90.0, -300.0], [95.0, -300.0], [500.0, -300.0]]
+    targets = [
+        dataclasses.replace(tracks.vehicles[0], id=f"t{n}", xy_m=np.array([end])) for n, end in enumerate(ends)
+    ]
     no_marks = tracks.marks._make(column[:0] for column in tracks.marks)
     axes = Figure().add_subplot()
-    picture.draw_map(axes, dataclasses.replace(tracks, targets=[top], marks=no_marks), {})
-    assert axes.texts[0].get_verticalalignment() == "top"
+    picture.draw_map(axes, dataclasses.replace(tracks, targets=targets, marks=no_marks), {})
+    assert [each.get_va() for each in axes.texts[:4]] == ["top", "bottom", "top", "bottom"]
 
 
 def test_the_legend_of_the_map_names_targets_which_no_tracker_published(left: tuple[Path, Recorder]) -> None:

@@ -65,6 +65,7 @@ def test_every_command_answers_to_h_as_to_help(swarm: Swarm, monkeypatch: pytest
             assert (code, told) == (0, swarm("", *path, "--help")), path
             assert f"Usage: {' '.join(['swarm', *path])} " in said
             assert max(map(len, said.splitlines())) <= 80
+            assert not {"range", "<bool>", "[0<=x"}.intersection(said.split()), path
         # The others inherit it.
         assert each.context_settings.get("help_option_names", ["-h"])[0] == "-h", path
 
