@@ -6,6 +6,7 @@ This module imports rasterio, which agents never need.
 
 from __future__ import annotations
 
+import glob
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -80,10 +81,10 @@ def own_system(dataset: Any, what: str, path: Path | None = None) -> Any:
 
     path  of the file, unless GDAL calls it the same
     """
-    beside = (path or Path(dataset.name)).with_suffix(".prj")
-    if dataset.crs or not beside.is_file():
-        return dataset.crs
-    return system_named(read_text(beside, FileKind.SYSTEM), f"{what}: {beside}")
+    path = path or Path(dataset.name)
+    for beside in () if dataset.crs else sorted(path.parent.glob(f"{glob.escape(path.stem)}.[pP][rR][jJ]")):
+        return system_named(read_text(beside, FileKind.SYSTEM), f"{what}: {beside}")
+    return dataset.crs
 
 
 def crs_of(found: Any, given: str | None, what: str, key: str = "terrain.crs") -> Any:
@@ -309,9 +310,7 @@ def plan_grid(
     north_up = transform.b == transform.d == 0 and transform.a > 0 > transform.e
     if not north_up:
         mirrored = "! " * (transform.determinant > 0 and transform.a < 0)
-        notes.append(
-            f"{mirrored}the file is mirrored, rotated or upside down; resampled north-up, with voids beside"
-        )
+        notes.append(f"{mirrored}the file is mirrored, rotated or upside down; resampled north-up, voids beside")
     if target == crs and north_up and is_kept(width, height, max(rows, cols), resolution_m):
         check_size(rows, cols, what, float(transform.a))
         grid = GridSpec(rows, cols, float(transform.a), float(transform.c), float(transform.f), _system(crs))

@@ -151,9 +151,8 @@ def _resampling_of(heights_m: Floats) -> _Resampling | None:
         cells = min(count, int(_TRIED_CELLS * factor))
         start = (count - cells) // 2
         some = lines[start : start + cells]
-        tried = [
-            [_Resampling(1 / factor, phase / _PHASES, kernel) for phase in range(_PHASES)] for kernel in KERNELS
-        ]
+        phases = np.arange(_PHASES) / _PHASES
+        tried = [[_Resampling(1 / factor, phase, kernel) for phase in phases.tolist()] for kernel in KERNELS]
         errors = np.array([[_error(some, each) for each in row] for row in tried])
         kernel, phase = np.unravel_index(errors.argmin(), errors.shape)
         if errors[kernel, phase] > _MAYBE * np.median(errors[kernel]):

@@ -324,6 +324,9 @@ def test_a_part_of_another_shapefile_is_refused(tmp_path: Path) -> None:
             (tmp_path / f"mixed{part}").write_bytes(source.with_suffix(part).read_bytes())
         with pytest.raises(TerrainError, match=r"is damaged: its \.shx is that of another file"):
             closed_by(str(tmp_path / "mixed.shp"), "forbidden")
+    (tmp_path / "mixed.shx").unlink()
+    with pytest.raises(TerrainError, match=r"mixed\.shp lacks mixed\.shx, its index: copy it, too"):
+        closed_by(str(tmp_path / "mixed.shp"), "forbidden")
 
 
 # --- extents and fences -------------------------------------------------------------------------------------

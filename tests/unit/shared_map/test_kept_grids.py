@@ -64,10 +64,9 @@ def write_surfer(path: Path, side_m: float) -> None:
 
 def write_points(path: Path, side_m: float) -> None:
     xs, ys = WEST + (np.arange(COLS) + 0.5) * side_m, NORTH - (np.arange(ROWS) + 0.5) * side_m
+    y, x = np.meshgrid(ys, xs, indexing="ij")
     lines = [
-        f"{x!r} {y!r} {HEIGHTS[r, c]:.4f}"
-        for r, y in enumerate(map(float, ys))
-        for c, x in enumerate(map(float, xs))
+        "{!r} {!r} {:.4f}".format(*point) for point in np.stack([x, y, HEIGHTS], axis=-1).reshape(-1, 3).tolist()
     ]
     path.write_text("\n".join(lines) + "\n")
 

@@ -113,14 +113,8 @@ def test_the_merge_rule_cell_by_cell() -> None:
     def zone(kind: str, col0: int, col1: int) -> ZoneConfig:
         return ZoneConfig(kind=kind, polygon_m=((10 * col0, 0), (10 * col1, 0), (10 * col1, 10), (10 * col0, 10)))
 
-    zones = (
-        zone("forbidden", 1, 2),
-        zone("rough", 0, 2),
-        zone("preferred", 7, 8),
-        zone("road", 3, 8),
-        zone("rough", 3, 4),
-    )
-    paint_zones(pace, zones, grid, cost, void=np.isnan(grades))
+    drawn = (("forbidden", 1, 2), ("rough", 0, 2), ("preferred", 7, 8), ("road", 3, 8), ("rough", 3, 4))
+    paint_zones(pace, [zone(*each) for each in drawn], grid, cost, void=np.isnan(grades))
     # rough doubles; forbidden heartbeats later paint; a road bridges water and cliffs, never a void
     np.testing.assert_allclose(pace, [[0.2, inf, 0.05, 0.1, 0.05, 0.05, inf, 0.05]])
 

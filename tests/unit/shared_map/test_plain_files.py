@@ -79,10 +79,10 @@ def test_a_bad_npz_is_refused_with_a_sentence(tmp_path: Path) -> None:
     path = tmp_path / "a.npz"
     for arrays, words in (
         ({"height": np.ones((3, 3))}, r"no `elevation` \(read: .*resolution_m.*\); it has height"),
-        ({"elevation": np.ones(3)}, r"elevation is \(3,\) float64; expected numbers in 2 dimensions"),
+        ({"elevation": np.ones(3)}, r"elevation is \(3,\) float64; expected rows of numbers"),
         ({"elevation": np.ones((3, 3))}, "does not say how large a cell is; set terrain.resolution_m"),
         ({"elevation": np.ones((3, 3)), "resolution_m": -1.0}, "must be positive"),
-        ({"elevation": np.array([["a", "b"]])}, "expected numbers"),
+        ({"elevation": np.array([["a", "b"]])}, "expected rows of numbers"),
         ({"elevation": np.ones((3, 3)), "resolution_m": "a"}, "its cell size is no single number"),
     ):
         np.savez(path, **arrays)

@@ -53,12 +53,8 @@ def test_degrees_are_put_on_square_metres(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("crs", ["EPSG:3857", "EPSG:2263"])
 def test_systems_whose_unit_is_no_true_metre_are_reprojected(tmp_path: Path, crs: str) -> None:
-    where = (
-        from_origin(980_000, 200_000, 100, 100)
-        if crs == "EPSG:2263"
-        else from_origin(1_000_000, 5_900_000, 100, 100)
-    )
-    source = load(write(tmp_path / "a.tif", heights(), where, crs))
+    corner = (980_000, 200_000) if crs == "EPSG:2263" else (1_000_000, 5_900_000)
+    source = load(write(tmp_path / "a.tif", heights(), from_origin(*corner, 100, 100), crs))
     true_m = 30.48 if crs == "EPSG:2263" else 100 * np.cos(np.radians(46.7))
     assert source.grid.resolution_m == pytest.approx(true_m, rel=0.01)
 

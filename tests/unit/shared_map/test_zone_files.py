@@ -190,12 +190,7 @@ def test_classes_of_roads_and_water_are_those_of_openstreetmap_or_ones_own(tmp_p
 
 
 def test_factors_and_paces_come_from_a_column_a_value_or_a_class(tmp_path: Path) -> None:
-    boxes = [
-        shapely.box(2, 2, 10, 10),
-        shapely.box(6, 6, 14, 14),
-        shapely.box(20, 2, 28, 10),
-        shapely.box(30, 2, 38, 10),
-    ]
+    boxes = [shapely.box(x, y, x + 8, y + 8) for x, y in ((2, 2), (6, 6), (20, 2), (30, 2))]
     columns = {"f": [2.0, 3.0, np.nan, -1.0], "kind": ["mud", "sand", "mud", "ice"]}
     file = written(tmp_path / "a.gpkg", boxes, UTM.crs, columns)
     pace, (facts,) = painted([ZoneConfig(kind="factor", file=file, attribute="f")])
