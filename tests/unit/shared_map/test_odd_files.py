@@ -119,8 +119,7 @@ REFUSED: dict[str, tuple[Callable[[Path], Path], str]] = {
     "PCRaster": (lambda p: said(p, "a.map", b"RUU CROSS SYSTEM MAP FORMAT" + bytes(300)), "is a map of PCRaster;"),
     "UTF-16": (lambda p: said(p, "a.xyz", "1 2 3\n".encode("utf-16")), "is text in UTF-16; .* save it as UTF-8"),
     "grey levels with a place": (
-        lambda p: picture(p.with_suffix(".png"), GROUND.astype(np.uint8)),
-        r"how high a grey level is; set terrain\.height_scale",
+        lambda p: picture(p.with_suffix(".png"), GROUND.astype(np.uint8)), "how high a grey level is; set terrain",
     ),
     "an image of a ROS map": (lambda p: said(p, "a.pgm", "P5\n2 2\n255\n1234"), r"name the \.yaml of the map"),
 }  # fmt: skip
