@@ -77,13 +77,16 @@ def system_named(text: str, what: str) -> Any:
 
 
 def own_system(dataset: Any, what: str, path: Path | None = None) -> Any:
-    """The coordinate system of a raster, or of the .prj beside it, which GDAL reads beside some formats only.
+    """The coordinate system of a raster, or of the .prj beside it, which GDAL reads beside some formats only; of
+    degrees in a netCDF that names none, WGS 84.
 
     path  of the file, unless GDAL calls it the same
     """
     path = path or Path(dataset.name)
     for beside in () if dataset.crs else sorted(path.parent.glob(f"{glob.escape(path.stem)}.[pP][rR][jJ]")):
         return system_named(read_text(beside, FileKind.SYSTEM), f"{what}: {beside}")
+    if not dataset.crs and "degrees_north" in dataset.tags().values():  # a latitude of netCDF, by its conventions
+        return rasterio.CRS.from_epsg(4326)
     return dataset.crs
 
 

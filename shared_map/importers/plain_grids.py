@@ -71,7 +71,7 @@ def read_npz(path: Path, what: str) -> Numbers:
     ignored = [f"! not read: the arrays {', '.join(unread)} (read: {_READ_ARRAYS})"] * bool(unread)
     heights, notes = heights.astype(np.float32), ("arrays of NumPy", *ignored)
     try:
-        numbers = {name: float(array) for name, array in arrays.items()}
+        numbers = {name: float(array.item()) for name, array in arrays.items()}
     except (TypeError, ValueError) as error:
         raise TerrainError(f"{what}: its cell size is no single number: {error}") from error
     for name in {"resolution_m", "dx", "dy"} & numbers.keys():
@@ -177,7 +177,7 @@ def read_ros(path: Path) -> Numbers:
     """
     try:
         raw = yaml.safe_load(read_text(path, FileKind.ROS_MAP))
-        found = msgspec.convert(raw, _RosMap, strict=False)
+        found = msgspec.convert(raw if isinstance(raw, dict) else {}, _RosMap, strict=False)
     except msgspec.ValidationError as error:
         raise TerrainError(f"terrain {path} is no ROS map: {explain(str(error), raw, _RosMap, 'map')}") from error
     except (yaml.YAMLError, ValueError, RecursionError) as error:
@@ -327,7 +327,8 @@ def _points_of(path: Path, what: str) -> tuple[Callable[[], Iterator[Points]], b
     if not first:
         raise TerrainError(f"{what} holds no numbers")
     mark = next((each for each in ";\t," if each in first), None)
-    words = [word.strip(" \"'").lower() for word in first.split(mark)]
+    decimal = "," if mark in (";", "\t") else "."
+    words = [word.strip(" \"'").lower() for word in first.replace(decimal, ".").split(mark)]
     header, columns, is_degrees = 0, (0, 1, 2), False
     try:
         np.array([word or "nan" for word in words], np.float64)
@@ -342,7 +343,7 @@ def _points_of(path: Path, what: str) -> tuple[Callable[[], Iterator[Points]], b
     empty = None if mark is None else re.compile(f"(?:(?<={mark})|^) *(?={mark}|$)")
 
     def numbers_of(lines: Iterable[str]) -> Points:
-        filled = lines if empty is None else [empty.sub("nan", line) for line in lines]
+        filled = lines if empty is None else [empty.sub("nan", each.replace(decimal, ".")) for each in lines]
         return np.loadtxt(filled, np.float64, delimiter=mark, usecols=columns, ndmin=2, comments=None)
 
     def points() -> Iterator[Points]:

@@ -419,6 +419,8 @@ def checked_xml(data: bytes, what: str) -> None:
             if name == "NetworkLink":
                 raise TerrainError(f"{what} has a NetworkLink, which is not followed; save its areas in one file")
             id, tags = element.get("id"), _AREA_TAGS.get(name, ())
+            if element.get("action") == "delete" or element.get("visible") == "false":
+                raise TerrainError(f"{what}: {name} {id} is deleted, but still in the file; download the area anew")
             is_area = any([inner.get("k"), inner.get("v")] in tags for inner in element)
             if name in ("node", "way"):
                 known.add((name, id))

@@ -116,7 +116,7 @@ def _friction(zone: ZoneConfig, path: Path, grid: GridSpec, where: str) -> Burnt
     """A raster of paces or factors. Infinite is lethal; where there is no value the ground is left as it is."""
     what = f"{where} {path}"
     if zone.kind not in ("pace", "factor"):
-        raise TerrainError(f"{what} is a raster, which goes with kind pace or factor, found {zone.kind!r}")
+        raise TerrainError(f"{what} is read as a raster, which goes with kind pace or factor, found {zone.kind!r}")
     given = [key for key in ("layer", "attribute", "width_m", "classes", "value") if getattr(zone, key)]
     if given:
         raise TerrainError(f"{what} is a raster, which has no {given[0]}")

@@ -62,9 +62,8 @@ def collection(*more: Any) -> Damage:
 
 
 def reverse(f: dict[str, Any], chance: random.Random) -> None:
-    f["geometry"] = shapely.geometry.mapping(
-        shapely.transform(shapely.geometry.shape(f["geometry"]), lambda p: p[:, ::-1])
-    )
+    turned = shapely.transform(shapely.geometry.shape(f["geometry"]), lambda p: p[:, ::-1])
+    f["geometry"] = shapely.geometry.mapping(turned)
 
 
 KINDS = ["forbidden", "water", "factor", "keep_in"]

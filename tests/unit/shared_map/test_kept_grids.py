@@ -94,9 +94,8 @@ WRITERS: dict[str, Callable[[Path, float], None]] = {
 def test_any_importer_keeps_a_square_metric_grid(ending, side_m, tmp_path_factory):
     path = tmp_path_factory.mktemp("kept") / f"dem.{ending}"
     WRITERS[ending](path, side_m)
-    source = load(
-        path, crs=None if ending in ("tif", "img", "bil", "dat", "raw", "nc", "4.nc", "anything", "npz") else UTM
-    )
+    known = ("tif", "img", "bil", "dat", "raw", "nc", "4.nc", "anything", "npz")
+    source = load(path, crs=None if ending in known else UTM)
     assert source.grid.shape == HEIGHTS.shape
     assert source.grid.resolution_m == pytest.approx(side_m, rel=1e-6)
     np.testing.assert_allclose(source.elevation_m, HEIGHTS, rtol=0, atol=1e-4)

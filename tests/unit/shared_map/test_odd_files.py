@@ -220,6 +220,7 @@ def test_an_island_in_a_hole_is_closed_and_a_hole_in_a_hole_is_asked_about(tmp_p
     ("text", "words"),
     [
         (osm([0, 1, 3, 2], '<tag k="natural" v="water"/>'), "way 7 is an area, but its ring is not closed"),
+        (osm([0, 1], "").replace("<way", '<way action="delete"'), "way 7 is deleted, but still in the file"),
         ("#saved by Mission Planner\n46.9\t9\n", r"fence of Mission Planner .* save it as \.waypoints"),
         ("none\n1\n   9.0  46.9\n   9.1 46.9\nEND\nEND\n", "an area of Osmosis"),
         ("\0\0\0\r\n\tOSMHeader", "osmium cat"),

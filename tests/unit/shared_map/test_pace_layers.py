@@ -150,10 +150,9 @@ def test_a_zone_outside_the_terrain_is_refused_with_a_sentence() -> None:
     far = ZoneConfig(kind="forbidden", name="swamp", polygon_m=((900, 900), (950, 900), (950, 950)))
     with pytest.raises(TerrainError, match=r"'swamp' covers no cell.* 300 m x 200 m"):
         zone_mask(far, GridSpec(20, 30, 10.0))
+    level = TerrainConfig(source="synthetic", rows=20, cols=30)
     with pytest.raises(TerrainError, match="covers no cell"):
-        build_terrain(
-            Scenario(terrain=TerrainConfig(source="synthetic", rows=20, cols=30), cost=CostConfig(zones=(far,)))
-        )
+        build_terrain(Scenario(terrain=level, cost=CostConfig(zones=(far,))))
 
 
 def test_a_zone_may_be_a_painted_mask(tmp_path: Path) -> None:

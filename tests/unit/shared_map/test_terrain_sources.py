@@ -221,6 +221,16 @@ def two_variables(folder: Path) -> dict[str, Any]:
     return {"source": folder / "a.nc"}
 
 
+def test_degrees_of_a_netcdf_that_names_no_system_are_those_of_wgs_84(tmp_path: Path) -> None:
+    with netcdf_file(tmp_path / "a.nc", "w") as file:
+        for axis, count, first, unit in (("lat", 40, 46.0, b"degrees_north"), ("lon", 50, 9.0, b"degrees_east")):
+            file.createDimension(axis, count)
+            places = file.createVariable(axis, "f8", (axis,))
+            places.units, places[:] = unit, first + np.arange(count) / 1000
+        file.createVariable("z", "f4", ("lat", "lon"))[:] = heights()
+    assert said(load(tmp_path / "a.nc").notes, " m in EPSG:4326")
+
+
 NOISE = np.random.default_rng(1).normal(size=(400, 400)).astype(np.float32)
 PHOTO = np.zeros((3, 9, 9), np.uint8)
 FEET = 'LOCAL_CS["mine",UNIT["foot",0.3048]]'

@@ -61,9 +61,8 @@ def test_lines_are_as_wide_as_they_are_and_never_broken(tmp_path_factory, corner
     line = shapely.LineString(corners)
     if not line.intersects(shapely.box(0, 0, UTM.cols, UTM.rows)):
         return
-    file = geojson(
-        tmp_path_factory.mktemp("zone") / "a.geojson", [feature(line, highway="road", width=f"{width_m} m")]
-    )
+    path = tmp_path_factory.mktemp("zone") / "a.geojson"
+    file = geojson(path, [feature(line, highway="road", width=f"{width_m} m")])
     pace, _ = painted([ZoneConfig(kind="road", file=file)])
     road = pace < 0.09
     away_m = np.full(road.shape, np.inf)
