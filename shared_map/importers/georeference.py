@@ -146,19 +146,16 @@ def metric_crs(crs: Any, lon_deg: float, lat_deg: float, lat_span_deg: float) ->
     """
     if is_local(crs):
         return crs
-    local = rasterio.CRS.from_proj4(
-        f"+proj=tmerc +lat_0={lat_deg:.6f} +lon_0={lon_deg:.6f} {_shape_of(crs)} +units=m +no_defs"
-    )
-    if crs.is_projected and abs(_scale(crs, local) - 1.0) < MOST_STRETCH:
-        _, metres = crs.linear_units_factor
-        if abs(metres - 1.0) < 1e-9:
-            return crs
+    rest = f"+lon_0={lon_deg:.6f} {_shape_of(crs)} +units=m +no_defs"
+    local = rasterio.CRS.from_proj4(f"+proj=tmerc +lat_0={lat_deg:.6f} {rest}")
+    is_metric = crs.is_projected and abs(crs.linear_units_factor[1] - 1.0) < 1e-9
+    if is_metric and abs(_scale(crs, local) - 1.0) < MOST_STRETCH:
+        return crs
     stretch = math.radians(lat_span_deg / 2) * abs(math.tan(math.radians(lat_deg)))
     if crs.is_geographic and stretch < 0.01:
         if crs.to_epsg() in _LIKE_WGS84:
             return rasterio.CRS.from_proj4(equidistant(lat_deg, lon_deg))
-        text = f"+proj=eqc +lat_ts={lat_deg:.6f} +lon_0={lon_deg:.6f} {_shape_of(crs)} +units=m +no_defs"
-        return rasterio.CRS.from_proj4(text)
+        return rasterio.CRS.from_proj4(f"+proj=eqc +lat_ts={lat_deg:.6f} {rest}")
     return local
 
 
@@ -277,9 +274,7 @@ def plan_grid(
         grid; if no cell fits, or more than `MAX_CELLS` do.
     """
     if not crs.is_geographic and not crs.is_projected and not is_local(crs):
-        raise TerrainError(
-            f"{what} is in {crs_name(crs)}, without metres or degrees: reproject it, or set terrain.crs"
-        )
+        raise TerrainError(f"{what} is in {crs_name(crs)}, without metres or degrees: warp it, or set terrain.crs")
     degrees = crs if is_local(crs) else degrees_of(crs)
     west, south, east, north = bounds_in(transform, rows, cols, crs, degrees)
     if not np.isfinite([west, south, east, north]).all():

@@ -89,9 +89,7 @@ def holds_cover(dataset: Any, what: str, config: TerrainConfig) -> bool:
     codes = np.unique(sample)
     if not 0 < codes.size <= _MOST_CODES:
         return False
-    answers = (
-        "terrain.cover_codes = {} if it is land cover, terrain.elevation_encoding = 'metres' if it has heights"
-    )
+    answers = "terrain.cover_codes = {} if it is land cover, terrain.elevation_encoding = 'metres' if heights"
     if has_palette:
         if land_cover.meaning_of(dataset, what, config) is not None:
             return True
@@ -173,10 +171,7 @@ def _heights(
     level = np.concatenate([values > 0 for _, values in seen])
     elevation_m = np.empty(grid.shape, np.float32)
     for rows, stored in placed.on_grid("average" if placed.grows else "bilinear", 1, "reading heights", progress):
-        elevation_m[rows] = voids_as_nan(stored, voids)
-        if (factor, offset) != (1.0, 0.0):
-            elevation_m[rows] *= np.float32(factor)
-            elevation_m[rows] += np.float32(offset)
+        elevation_m[rows] = voids_as_nan(stored, voids) * np.float32(factor) + np.float32(offset)
     classes = np.zeros(elevation_m.shape, np.uint8)
     return Source(grid, elevation_m, classes, level=level, notes=(*notes, *scale_notes, *looks))
 
@@ -187,11 +182,8 @@ def _scale_of(dataset: Any, crs: Any, config: TerrainConfig) -> tuple[float, flo
     factor, offset = float(dataset.scales[0]), float(dataset.offsets[0])
     if (factor, offset) != (1.0, 0.0):
         notes.append(f"heights are stored as {dataset.dtypes[0]}; scale {factor:g} and offset {offset:g} applied")
-    axes = [
-        axis
-        for part in crs.to_dict(projjson=True).get("components", [])
-        for axis in part["coordinate_system"]["axis"]
-    ]
+    parts = crs.to_dict(projjson=True).get("components", [])
+    axes = [axis for part in parts for axis in part["coordinate_system"]["axis"]]
     # A vertical system such as EPSG:5715, or a variable of a netCDF.
     if any(axis["direction"] == "down" for axis in axes) or dataset.tags(1).get("positive") == "down":
         factor, offset = -factor, -offset

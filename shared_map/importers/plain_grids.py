@@ -231,7 +231,6 @@ def _grey(path: Path) -> tuple[NDArray[np.float32], int]:
     return np.where(colours[..., 3] > 0, colours[..., :3].mean(axis=-1), np.float32(np.nan)), 255
 
 
-_KIND = FileKind.POINTS
 _LINES, _LONGEST = 10_000, 4096
 """Lines that are read at once, and bytes of the longest: 40 MB."""
 _MOST_STEPS = 1 << 20
@@ -365,7 +364,7 @@ def _points_of(path: Path, what: str) -> tuple[Callable[[], Iterator[Points]], b
 
 def _lines(path: Path) -> Iterator[tuple[int, str]]:
     """(number, line) of those that are neither empty nor a comment."""
-    stripped = ((n, line.strip(" ")) for n, line in enumerate(read_lines(path, _KIND, _LONGEST), 1))
+    stripped = ((n, line.strip(" ")) for n, line in enumerate(read_lines(path, FileKind.POINTS, _LONGEST), 1))
     return ((n, line) for n, line in stripped if line and not line.startswith("#"))
 
 

@@ -467,7 +467,6 @@ def mask_of(path: Path, grid: GridSpec) -> NDArray[np.bool_]:
     """
     with opened(path, "mask") as dataset:
         if (dataset.height, dataset.width) != (grid.rows, grid.cols):
-            raise TerrainError(
-                f"mask {path} has {dataset.height} x {dataset.width} pixels, the terrain {grid.rows} x {grid.cols}"
-            )
+            found = f"{dataset.height} x {dataset.width} pixels"
+            raise TerrainError(f"mask {path} has {found}, the terrain {grid.rows} x {grid.cols}")
         return np.asarray(dataset.read(1) != 0, np.bool_)

@@ -216,9 +216,8 @@ def _refined(lines: _Doubles, found: _Resampling, start: int, cells: int) -> _Re
 
         tries = middle.step + np.array([0, 0.2 / cells, 0]), middle.first + np.array([0, 0, 0.06])
         options: Any = {"initial_simplex": np.column_stack(tries), "maxfev": 50, "xatol": 1e-7}
-        step, first = minimize(
-            error, np.array([middle.step, middle.first]), method="Nelder-Mead", options=options
-        ).x
+        begin_at = np.array([middle.step, middle.first])
+        step, first = minimize(error, begin_at, method="Nelder-Mead", options=options).x
         found = _Resampling(float(step), float(first), kernel).moved(-cells / 2)
         if cells >= min(count, _LONGEST):
             break

@@ -176,9 +176,7 @@ def without_voids(source: Source, config: TerrainConfig) -> Source:
     """Voids counted, and filled if asked for; nothing is done in silence."""
     from shared_map.importers.water_and_voids import clear_voids, fill_voids
 
-    elevation_m = source.elevation_m
-    if not elevation_m.flags.writeable:
-        elevation_m = elevation_m.copy()
+    elevation_m = np.require(source.elevation_m, requirements="W")
     some_m = elevation_m[::_SOME, ::_SOME].copy()
     count = clear_voids(elevation_m)
     if count == 0:

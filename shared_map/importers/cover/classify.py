@@ -515,9 +515,8 @@ def held_out(
     true, predicted : uint8 (labelled cells,), TerrainClass
     """
     columns, kinds = _samples(rgb, elevation_m, resolution_m, labels)
-    names, of_cell, cells = np.unique(
-        groups[labels != TerrainClass.UNKNOWN], return_inverse=True, return_counts=True
-    )
+    labelled = groups[labels != TerrainClass.UNKNOWN]
+    names, of_cell, cells = np.unique(labelled, return_inverse=True, return_counts=True)
     parts = min(5, len(names))
     part = np.empty(len(names), np.intp)
     part[np.argsort(-cells, kind="stable")] = np.arange(len(names)) % parts

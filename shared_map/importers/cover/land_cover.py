@@ -26,6 +26,7 @@ from shared_map.importers.raster_files import opened, sampled
 from shared_map.importers.terrain_sources import Source
 from shared_map.terrain.pace_layers import TerrainClass
 from shared_map.terrain.row_bands import Progress, no_progress
+from swarm.config.explain import nearest
 from swarm.config.ground import TerrainConfig
 from swarm.config.input_files import FileKind, read_text
 from swarm.config.setting_types import CoverGround
@@ -192,15 +193,12 @@ def with_cover(source: Source, path: Path, config: TerrainConfig, progress: Prog
     notes = [*source.notes, *cover.notes]
     if wet.any():
         share = f"{wet.mean():.1%} of the terrain is water by photo or heights and ground by the land cover"
-        notes.append(
-            f"{share}, which counts; where it is too coarse for a lake, paint a forbidden zone (cost.zones)"
-        )
+        notes.append(f"{share}, which counts; if too coarse for a lake, paint a forbidden zone (cost.zones)")
     factor = np.where(known, cover.factor, np.float32(1))
     if source.factor is not None:
         factor *= source.factor
-    return replace(
-        source, classes=np.where(known, cover.classes, source.classes), factor=factor, notes=tuple(notes)
-    )
+    classes = np.where(known, cover.classes, source.classes)
+    return replace(source, classes=classes, factor=factor, notes=tuple(notes))
 
 
 def read_cover(path: Path, grid: GridSpec, config: TerrainConfig, progress: Progress = no_progress) -> Cover:
@@ -304,7 +302,8 @@ def meaning_of(dataset: Any, what: str, config: TerrainConfig) -> tuple[CoverTab
     sample = sampled_codes(dataset, what)
     if (name := config.cover_codes) is not None:
         if name not in TABLES and not os.path.isfile(name):  # also of a name that is too long
-            raise TerrainError(f"terrain.cover_codes {name!r} is neither {', '.join(TABLES)} nor a CSV file")
+            near = nearest(name[:60], [*TABLES])
+            raise TerrainError(f"terrain.cover_codes {name!r} is neither {', '.join(TABLES)} nor a CSV file{near}")
         table = TABLES[name] if name in TABLES else read_cover_table(Path(name))
         return table.replaced(own), f"as terrain.cover_codes = {name!r} says"
     only_own = CoverTable("own", "codes of one's own", own), "as terrain.cover_classes says"
@@ -346,11 +345,8 @@ def recognise(dataset: Any, sample: NDArray[Any], what: str) -> tuple[CoverTable
     """
     text, there = text_of(dataset), set(np.unique(sample).tolist())
     every = {key: {*table.grounds, *table.nothing} for key, table in TABLES.items()}
-    fits = [
-        table
-        for key, table in TABLES.items()
-        if there & table.grounds.keys() and np.isin(sample, [*every[key]]).mean() >= _LEAST_KNOWN
-    ]
+    known = {key: np.isin(sample, [*codes]).mean() for key, codes in every.items()}
+    fits = [TABLES[key] for key in TABLES if there & TABLES[key].grounds.keys() and known[key] >= _LEAST_KNOWN]
     # Whole numbers from 1 on, in colours, are anybody's codes.
     has_palette = dataset.colorinterp[0] == ColorInterp.palette
     by_codes = [table for table in fits if there <= every[table.key] and (table.gappy or not has_palette)]
@@ -365,7 +361,6 @@ def recognise(dataset: Any, sample: NDArray[Any], what: str) -> tuple[CoverTable
             keys = " or ".join(repr(table.key) for table in chosen)
             titles = ", and of ".join([*(table.title for table in chosen), *others])
             csv = ", or a CSV file of code and class" if others else ""
-            raise TerrainError(
-                f"{what}: its codes ({some(there)}) are those of {titles}; set terrain.cover_codes = {keys}{csv}"
-            )
+            found = f"its codes ({some(there)}) are those of {titles}"
+            raise TerrainError(f"{what}: {found}; set terrain.cover_codes = {keys}{csv}")
     return None

@@ -334,9 +334,7 @@ def _parts(shape: Any) -> list[Any]:
     if shape.geom_type != "Polygon" or not heavy or south - north < 2:
         return [shape]
     middle = float(np.floor((north + south) / 2))
-    halves = [
-        shapely.clip_by_rect(shape, west - 1, top, east + 1, bottom)
-        for top, bottom in ((north - 1, middle), (middle, south + 1))
-    ]
+    rows = ((north - 1, middle), (middle, south + 1))
+    halves = [shapely.clip_by_rect(shape, west - 1, top, east + 1, bottom) for top, bottom in rows]
     pieces = (piece for half in halves for piece in shapely.get_parts(half))
     return [part for piece in pieces if piece.geom_type == "Polygon" for part in _parts(piece)]

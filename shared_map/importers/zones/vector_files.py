@@ -126,9 +126,8 @@ def open_layers(path: Path, layer: str | None, what: str) -> list[Layer]:
                 quoted = name.replace("'", "''")
                 held = read(source, sql=f"SELECT type FROM sqlite_master WHERE name = '{quoted}'")[3][0]
                 if held.tolist() not in ([], ["table"]):
-                    raise TerrainError(
-                        f"{what}: layer {name!r} is a {held[0]}, expected a table; ogr2ogr makes a copy of it"
-                    )
+                    found_is = f"is a {held[0]}, expected a table; ogr2ogr makes a copy of it"
+                    raise TerrainError(f"{what}: layer {name!r} {found_is}")
             index = listed[:, 0].tolist().index(name)
             info = pyogrio.read_info(source, layer=index, force_feature_count=True)
             count = max(int(info["features"]), least)  # GDAL believes the header of the index
@@ -318,13 +317,9 @@ class _Document(Struct, frozen=True):
     fileType: str = ""  # noqa: N815
 
 
-_document = msgspec.json.Decoder(_Document)
 _feature = msgspec.json.Decoder(Feature | Geometry)
-_lines = msgspec.json.Decoder(msgspec.Raw)
 _LOOKED_AT = 4096
 """Bytes in which the beginning of another format is looked for."""
-_RECORD = b"\x1e"
-"""The sign before each feature of a GeoJSON text sequence."""
 
 
 INCLUSION = "inclusion"
@@ -339,16 +334,17 @@ def checked_json(data: bytes, kind: Kind, what: str, name: str) -> bytes:
 
     Raises TerrainError with one sentence, which names the first feature that cannot be read.
     """
-    number, text = 0, data.removeprefix(b"\xef\xbb\xbf").replace(_RECORD, b"")
+    # Of a GeoJSON text sequence each feature begins with the sign 1E.
+    number, text = 0, data.removeprefix(b"\xef\xbb\xbf").replace(b"\x1e", b"")
     try:
         if kind.text == "fence":
             return _collection(fence_of_waypoints(text.decode("ascii")), name)
         try:
-            document = _document.decode(text)
+            document = msgspec.json.decode(text, type=_Document)
         except msgspec.DecodeError as error:
             if "trailing characters" not in str(error):
                 raise
-            document = _Document(features=_lines.decode_lines(text))
+            document = _Document(features=msgspec.json.Decoder(msgspec.Raw).decode_lines(text))
         if document.fileType:
             fence = msgspec.json.decode(text, type=_Plan).geoFence
             areas = [_area(each.polygon, each.inclusion) for each in fence.polygons]
@@ -411,9 +407,7 @@ def checked_xml(data: bytes, what: str) -> None:
             held = [inner.tag.rpartition("}")[2] for inner in element]
             one_of = _ONE_OF.get(name, ())
             if one_of and (count := sum(map(held.count, one_of))) != 1:  # of several, GDAL reads the last
-                raise TerrainError(
-                    f"{what} is damaged: a {name} holds {count} of {', '.join(one_of)}, expected one"
-                )
+                raise TerrainError(f"{what} is damaged: a {name} has {count} of {', '.join(one_of)}, expected one")
             if name == "rotation" and number_of(element.text or "0"):  # GDAL reads the overlay as if it were not
                 raise TerrainError(f"{what} has a turned overlay, which is not read; draw its area")
             if name == "NetworkLink":
@@ -447,8 +441,7 @@ def checked_xml(data: bytes, what: str) -> None:
         if any(count % 2 for count in met.values()):  # GDAL leaves it out
             raise TerrainError(f"{what}: relation {area} cannot be used: its ways form no closed ring; repair it")
     for absent in needed.keys() - known:
-        user = needed[absent]
-        raise TerrainError(f"{what} is not complete: {user} needs {absent[0]} {absent[1]}")
+        raise TerrainError(f"{what} is not complete: {needed[absent]} needs {absent[0]} {absent[1]}")
 
 
 # --- fences of ground stations ------------------------------------------------------------------------------

@@ -133,9 +133,8 @@ def _friction(zone: ZoneConfig, path: Path, grid: GridSpec, where: str) -> Burnt
     known = values[~np.isnan(values)]
     wrong = known[(known < LEAST) | (known > MOST)]
     if wrong.size:
-        raise TerrainError(
-            f"{what} holds {wrong[0]:g}, expected a {zone.kind} of {LEAST:g} to {MOST:g}, or inf if nothing drives"
-        )
+        expected = f"a {zone.kind} of {LEAST:g} to {MOST:g}, or inf if nothing drives"
+        raise TerrainError(f"{what} holds {wrong[0]:g}, expected {expected}")
     count = int(known.size + lethal.sum())
     if not count:
         raise TerrainError(f"{what} has no value on the terrain")

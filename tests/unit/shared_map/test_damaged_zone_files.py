@@ -265,8 +265,8 @@ REASONS = {
     "arcgis": "is ArcGIS JSON; it is not read; `ogr2ogr",
     "geopackage": "is damaged",
     "system as text": r"Expected `object \| null`, got `str` - at `\$\.crs`",
-    "kml of two borders": "a Polygon holds 2 of outerBoundaryIs, expected one",
-    "kml of two shapes": "a Placemark holds 2 of Point, LineString",
+    "kml of two borders": "a Polygon has 2 of outerBoundaryIs, expected one",
+    "kml of two shapes": "a Placemark has 2 of Point, LineString",
     "system unknown": "its crs 'EPSG:99999' is no coordinate system; write EPSG:32632",
     "zip": r"is damaged or no \.zip",
 }
