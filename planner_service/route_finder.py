@@ -16,9 +16,10 @@ from planner_service.strategy import STRATEGIES
 from planner_service.target_tree import TargetTree
 from planner_service.tree.cost_grid import CostGrid
 from shared_map.terrain.slope_and_climb import Climb
-from swarm.config.explain import choice, converted
+from swarm.config.explain import choice, converted, nearest
 from swarm.config.scenario import PlannerConfig
-from swarm.grid import GridSpec, Window, walk, whole
+from swarm.errors import ConfigError
+from swarm.grid import GridSpec, Window, real, walk, whole
 from swarm.wire.route_columns import Route, RouteStatus, TargetStatus, directions_of
 
 _KEPT_BYTES = 1 << 28
@@ -110,9 +111,12 @@ class RouteFinder:
         if self._pace.ndim != 2:
             raise ValueError(f"pace has {self._pace.ndim} dimensions, expected 2")
         rows, cols = self._pace.shape
-        _check_type("resolution_m", resolution_m, float | int | np.number)
+        self.grid = GridSpec(rows, cols, real("resolution_m", resolution_m))
         _check_type("climb", climb, Climb | None)
-        self.grid = GridSpec(rows, cols, resolution_m)
+        own = (*PlannerConfig.__struct_encode_fields__, "target", "resolution_m", "climb")
+        for key in settings.keys() - {*own}:
+            if near := nearest(key, own):
+                raise ConfigError(f"RouteFinder: unknown key {key}{near}")
         self._config = converted({"strategy": "full", **settings}, PlannerConfig, "RouteFinder", "settings")
         if (strategy := self._config.strategy) not in STRATEGIES:
             raise ValueError(f"strategy: found {strategy!r}{choice(strategy, tuple(STRATEGIES))}")
@@ -192,14 +196,11 @@ class RouteFinder:
         on one that the map's changes have shut; TypeError on anything else.
         """
         _check_type("route", route, FoundRoute)
-        puller = self._puller
         if route.status is not RouteStatus.OK:
-            raise ValueError(
-                f"route is {route.status.value!r}, expected 'ok': only a route to the target is pulled"
-            )
+            raise ValueError(f"route is {route.status.value!r}, expected 'ok': no other is pulled")
         at = route.cells @ np.array((self.grid.cols, 1), np.int64)
         codes = np.frombuffer(bytearray(directions_of(at, self.grid.cols)), np.uint8)
-        pulled, prices = puller.pull(at[:1], codes, np.array([codes.size]))
+        pulled, prices = self._puller.pull(at[:1], codes, np.array([codes.size]))
         if not np.isfinite(prices[0, 0]):
             raise ValueError("the route passes a cell or a corner that is shut by now: ask for it again")
         crossed = np.array(walk(self.grid, int(at[0]), pulled.directions.tobytes()))
@@ -223,15 +224,14 @@ class RouteFinder:
             return
         update = tree.update(pace, self._target, dirty, self._version)
         if update.wants_full:
-            grown = tree.full_job(self._target)()
-            tree.adopt(grown, pace, self._target, [], self._version, [])
+            tree.adopt(tree.full_job(self._target)(), pace, self._target, [], self._version, [])
         if tree.wants_strides:
             tree.take_strides(tree.stride_job()())
 
 
 def _check_type(name: str, value: object, kind: Any) -> None:
-    """Raises TypeError unless a value is of this type; Python takes True for 1."""
-    if isinstance(value, bool) or not isinstance(value, kind):
+    """Raises TypeError unless a value is of this type."""
+    if not isinstance(value, kind):
         raise TypeError(f"{name} is {reprlib.repr(value)}, expected {getattr(kind, '__name__', kind)}")
 
 

@@ -8,7 +8,9 @@ from __future__ import annotations
 
 import math
 import operator
+import reprlib
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import accumulate
@@ -37,6 +39,15 @@ def whole(value: Any) -> int:
     if isinstance(value, bool):
         raise TypeError(f"{value} is no whole number")
     return operator.index(value)
+
+
+def real(name: str, value: Any) -> float:
+    """A number as a float, also of NumPy's. Raises TypeError on anything else, such as text, and on True; `name` is
+    that of the value."""
+    if not isinstance(value, str | bytes | bool) and str(getattr(value, "dtype", "")) != "bool":
+        with suppress(TypeError, ValueError, OverflowError):
+            return float(value)
+    raise TypeError(f"{name} is {reprlib.repr(value)}, expected a number")
 
 
 STEP_ROW = (-1, -1, 0, 1, 1, 1, 0, -1)
@@ -168,10 +179,7 @@ class GridSpec:
     def centre_m(self, cell: int) -> tuple[float, float]:
         """(x_m, y_m) of the middle of a cell. Raises OutsideGridError outside the grid."""
         row, col = self.row_col(cell)
-        return (
-            self.west_m + (col + 0.5) * self.resolution_m,
-            self.north_m - (row + 0.5) * self.resolution_m,
-        )
+        return self.west_m + (col + 0.5) * self.resolution_m, self.north_m - (row + 0.5) * self.resolution_m
 
     def cell_at(self, x_m: float, y_m: float) -> int:
         """The cell that holds a place, -1 outside the grid."""

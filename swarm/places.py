@@ -12,12 +12,11 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterable, Sequence
-from numbers import Real
+from collections.abc import Sequence
 from typing import Any, Literal, NamedTuple, Protocol
 
 from swarm.errors import ConfigError
-from swarm.grid import GridSpec
+from swarm.grid import GridSpec, real
 
 Kind = Literal["cell", "xy", "latlon"]
 Corner = tuple[float, float]
@@ -83,28 +82,22 @@ def read_place(given: Given, what: str) -> Place:
     if isinstance(given, Place):
         return given
     if not isinstance(given, str):
-        numbers = list(given) if isinstance(given, Iterable) else []
-        if len(numbers) != 2 or not all(map(_is_number, numbers)):
-            raise ConfigError(f"{what} is {str(given)[:60]}; expected {FORMS}, or a row and a column")
-        row, col = numbers
-        return Place(f"[{row}, {col}]", "cell", row, col, row == int(row) and col == int(col))
-    match = _PLACE.fullmatch(given.strip())
+        try:
+            row, col = (real(what, each) for each in given)
+            return Place(f"[{row:.12g}, {col:.12g}]", "cell", row, col, row == int(row) and col == int(col))
+        except (TypeError, ValueError, OverflowError):
+            raise ConfigError(f"{what} is {str(given)[:60]}; expected {FORMS}, or row and column") from None
+    match: Any = _PLACE.fullmatch(given.strip())
     if match is None:
         comma = re.sub(r"(?<=[\d.])[\s;]+(?=[-+.\d])", ",", given.strip(), count=1)
         perhaps = f"; did you mean {comma[:60]!r}?" if _PLACE.fullmatch(comma) else ""
         raise ConfigError(f"{what} is {given[:60]!r}; expected {FORMS}{perhaps}")
-    first, second = match[2], match[3]
+    kind, first, second = match.groups()
     whole = all(_WHOLE.fullmatch(number) for number in (first, second))
-    kind: Any = match[1]
     place = Place(given.strip()[:60], kind, float(first), float(second), whole)
     if kind == "latlon" and not _is_degrees(place):
         raise ConfigError(f"{what} is {_shown(place)}: no latitude (-90 to 90) and longitude (-360 to 360)")
     return place
-
-
-def _is_number(value: Any) -> bool:
-    """Returns True for a finite number, also of NumPy's; True and False are none."""
-    return not isinstance(value, bool) and isinstance(value, Real) and math.isfinite(value)
 
 
 def cell_of(given: Given, frame: Frame, what: str) -> int:

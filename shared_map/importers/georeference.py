@@ -6,6 +6,7 @@ This module imports rasterio, which agents never need.
 
 from __future__ import annotations
 
+import glob
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
@@ -76,14 +77,17 @@ def system_named(text: str, what: str) -> Any:
 
 
 def own_system(dataset: Any, what: str, path: Path | None = None) -> Any:
-    """The coordinate system of a raster, or of the .prj beside it, which GDAL reads beside some formats only.
+    """The coordinate system of a raster, or of the .prj beside it, which GDAL reads beside some formats only; of
+    degrees in a netCDF that names none, WGS 84.
 
     path  of the file, unless GDAL calls it the same
     """
-    beside = (path or Path(dataset.name)).with_suffix(".prj")
-    if dataset.crs or not beside.is_file():
-        return dataset.crs
-    return system_named(read_text(beside, FileKind.SYSTEM), f"{what}: {beside}")
+    path = path or Path(dataset.name)
+    for beside in () if dataset.crs else sorted(path.parent.glob(f"{glob.escape(path.stem)}.[pP][rR][jJ]")):
+        return system_named(read_text(beside, FileKind.SYSTEM), f"{what}: {beside}")
+    if not dataset.crs and "degrees_north" in dataset.tags().values():  # a latitude of netCDF, by its conventions
+        return rasterio.CRS.from_epsg(4326)
+    return dataset.crs
 
 
 def crs_of(found: Any, given: str | None, what: str, key: str = "terrain.crs") -> Any:
@@ -142,19 +146,16 @@ def metric_crs(crs: Any, lon_deg: float, lat_deg: float, lat_span_deg: float) ->
     """
     if is_local(crs):
         return crs
-    local = rasterio.CRS.from_proj4(
-        f"+proj=tmerc +lat_0={lat_deg:.6f} +lon_0={lon_deg:.6f} {_shape_of(crs)} +units=m +no_defs"
-    )
-    if crs.is_projected and abs(_scale(crs, local) - 1.0) < MOST_STRETCH:
-        _, metres = crs.linear_units_factor
-        if abs(metres - 1.0) < 1e-9:
-            return crs
+    rest = f"+lon_0={lon_deg:.6f} {_shape_of(crs)} +units=m +no_defs"
+    local = rasterio.CRS.from_proj4(f"+proj=tmerc +lat_0={lat_deg:.6f} {rest}")
+    is_metric = crs.is_projected and abs(crs.linear_units_factor[1] - 1.0) < 1e-9
+    if is_metric and abs(_scale(crs, local) - 1.0) < MOST_STRETCH:
+        return crs
     stretch = math.radians(lat_span_deg / 2) * abs(math.tan(math.radians(lat_deg)))
     if crs.is_geographic and stretch < 0.01:
         if crs.to_epsg() in _LIKE_WGS84:
             return rasterio.CRS.from_proj4(equidistant(lat_deg, lon_deg))
-        text = f"+proj=eqc +lat_ts={lat_deg:.6f} +lon_0={lon_deg:.6f} {_shape_of(crs)} +units=m +no_defs"
-        return rasterio.CRS.from_proj4(text)
+        return rasterio.CRS.from_proj4(f"+proj=eqc +lat_ts={lat_deg:.6f} {rest}")
     return local
 
 
@@ -273,9 +274,7 @@ def plan_grid(
         grid; if no cell fits, or more than `MAX_CELLS` do.
     """
     if not crs.is_geographic and not crs.is_projected and not is_local(crs):
-        raise TerrainError(
-            f"{what} is in {crs_name(crs)}, without metres or degrees: reproject it, or set terrain.crs"
-        )
+        raise TerrainError(f"{what} is in {crs_name(crs)}, without metres or degrees: warp it, or set terrain.crs")
     degrees = crs if is_local(crs) else degrees_of(crs)
     west, south, east, north = bounds_in(transform, rows, cols, crs, degrees)
     if not np.isfinite([west, south, east, north]).all():
@@ -309,9 +308,7 @@ def plan_grid(
     north_up = transform.b == transform.d == 0 and transform.a > 0 > transform.e
     if not north_up:
         mirrored = "! " * (transform.determinant > 0 and transform.a < 0)
-        notes.append(
-            f"{mirrored}the file is mirrored, rotated or upside down; resampled north-up, with voids beside"
-        )
+        notes.append(f"{mirrored}the file is mirrored, rotated or upside down; resampled north-up, voids beside")
     if target == crs and north_up and is_kept(width, height, max(rows, cols), resolution_m):
         check_size(rows, cols, what, float(transform.a))
         grid = GridSpec(rows, cols, float(transform.a), float(transform.c), float(transform.f), _system(crs))

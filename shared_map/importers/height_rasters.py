@@ -5,6 +5,7 @@ Its numbers may be heights, or codes of land cover.
 
 from __future__ import annotations
 
+import re
 import tomllib
 from contextlib import ExitStack
 from dataclasses import replace
@@ -27,7 +28,8 @@ from swarm.config.ground import TerrainConfig
 from swarm.errors import TerrainError
 from swarm.grid import MAX_CELLS
 
-UNITS_M = tomllib.loads((Path(__file__).parent / "units.toml").read_text(encoding="utf-8"))
+_UNITS = tomllib.loads((Path(__file__).parent / "units.toml").read_text(encoding="utf-8"))
+UNITS_M = {unit.removesuffix("s"): metres for unit, metres in _UNITS.items()}
 """Names of units in files, as `_scale_of` leaves them -> metres."""
 _MOST_CODES, _LEAST_CODES = 256, 3
 """Different values of a map of codes: as many as a byte has; and with fewer than three a height model in whole
@@ -87,9 +89,7 @@ def holds_cover(dataset: Any, what: str, config: TerrainConfig) -> bool:
     codes = np.unique(sample)
     if not 0 < codes.size <= _MOST_CODES:
         return False
-    answers = (
-        "terrain.cover_codes = {} if it is land cover, terrain.elevation_encoding = 'metres' if it has heights"
-    )
+    answers = "terrain.cover_codes = {} if it is land cover, terrain.elevation_encoding = 'metres' if heights"
     if has_palette:
         if land_cover.meaning_of(dataset, what, config) is not None:
             return True
@@ -98,8 +98,6 @@ def holds_cover(dataset: Any, what: str, config: TerrainConfig) -> bool:
             + answers.format("a CSV file of code and class")
         )
     fits = [TABLES[key] for key, known in gappy.items() if np.isin(codes, known).all()]
-    if not fits:
-        return False
     text = land_cover.text_of(dataset)
     if any(word in text for table in fits for word in table.words):
         return land_cover.recognise(dataset, sample, what) is not None
@@ -123,7 +121,15 @@ def _place_of(dataset: Any, path: Path, config: TerrainConfig, is_cover: bool) -
     what = f"terrain {path}"
     own, system = dataset.tags().get(NOTES), own_system(dataset, what)
     notes = () if own is None else tuple(own.split("\n"))
-    if not dataset.transform.is_identity:
+    has_place, is_grey = not dataset.transform.is_identity, dataset.driver in ("PNG", "BMP") and not is_cover
+    needed = {}
+    if not has_place and config.resolution_m is None:
+        needed["how large a cell is"] = "terrain.resolution_m (metres)"
+    if is_grey and config.height_scale is None:
+        needed["how high a grey level is"] = "terrain.height_scale (metres per grey level)"
+    if needed:
+        raise TerrainError(f"{what} does not say {' and '.join(needed)}; set {' and '.join(needed.values())}")
+    if has_place:
         if own is not None and not system and config.crs is None:
             check_metres(dataset.transform.a, dataset.transform.c, what)
             notes = (*notes, "x and y are taken for metres of a system without a name; terrain.crs names it")
@@ -132,10 +138,6 @@ def _place_of(dataset: Any, path: Path, config: TerrainConfig, is_cover: bool) -
         if crs.is_projected:
             check_metres(dataset.transform.a, dataset.transform.c, what)
         return crs, dataset.transform, (*notes, *overruled(system, config.crs, dataset.transform))
-    is_grey = dataset.driver in ("PNG", "BMP") and not is_cover
-    if config.resolution_m is None or (is_grey and not config.height_scale):
-        scale = " and terrain.height_scale (metres per grey level)" if is_grey else ""
-        raise TerrainError(f"{what} does not say how large a cell is; set terrain.resolution_m (metres){scale}")
     if system or config.crs not in (None, "local"):
         notes = (*notes, "! the file has a system, but no place in it: x and y count from its north-west corner")
     anywhere = from_origin(0.0, 0.0, config.resolution_m, config.resolution_m)
@@ -159,9 +161,7 @@ def _heights(
     if voids and not placed.is_cells:  # of a second value of no height GDAL would make slopes
         if dataset.height * dataset.width > MAX_CELLS:
             listed = ", ".join(f"{void:g}" for void in voids)
-            raise TerrainError(
-                f"terrain {path} has undeclared voids ({listed}): gdal_edit.py -a_nodata declares one"
-            )
+            raise TerrainError(f"terrain {path} has undeclared voids {listed}: gdal_edit.py -a_nodata declares one")
         known = np.where(dataset.read_masks(1) > 0, dataset.read(1).astype(np.float32), np.float32(np.nan))
         whole = Numbers(voids_as_nan(known, voids), placed.transform, placed.crs)
         placed = replace(placed, dataset=in_memory(whole, files))
@@ -171,10 +171,7 @@ def _heights(
     level = np.concatenate([values > 0 for _, values in seen])
     elevation_m = np.empty(grid.shape, np.float32)
     for rows, stored in placed.on_grid("average" if placed.grows else "bilinear", 1, "reading heights", progress):
-        elevation_m[rows] = voids_as_nan(stored, voids)
-        if (factor, offset) != (1.0, 0.0):
-            elevation_m[rows] *= np.float32(factor)
-            elevation_m[rows] += np.float32(offset)
+        elevation_m[rows] = voids_as_nan(stored, voids) * np.float32(factor) + np.float32(offset)
     classes = np.zeros(elevation_m.shape, np.uint8)
     return Source(grid, elevation_m, classes, level=level, notes=(*notes, *scale_notes, *looks))
 
@@ -185,25 +182,22 @@ def _scale_of(dataset: Any, crs: Any, config: TerrainConfig) -> tuple[float, flo
     factor, offset = float(dataset.scales[0]), float(dataset.offsets[0])
     if (factor, offset) != (1.0, 0.0):
         notes.append(f"heights are stored as {dataset.dtypes[0]}; scale {factor:g} and offset {offset:g} applied")
-    axes = [
-        axis
-        for part in crs.to_dict(projjson=True).get("components", [])
-        for axis in part["coordinate_system"]["axis"]
-    ]
+    parts = crs.to_dict(projjson=True).get("components", [])
+    axes = [axis for part in parts for axis in part["coordinate_system"]["axis"]]
     # A vertical system such as EPSG:5715, or a variable of a netCDF.
     if any(axis["direction"] == "down" for axis in axes) or dataset.tags(1).get("positive") == "down":
         factor, offset = -factor, -offset
         notes.append("the file states depths; heights are their negatives")
     text = str(dataset.units[0] or "").lower()
     # [m], US_survey_foot and ft (US) without their brackets and signs.
-    unit = " ".join("".join(sign if sign.isalnum() else " " for sign in text).split())
-    unit_m = UNITS_M.get(unit, UNITS_M.get(unit.removesuffix("s"), 1.0))
-    if unit and not {unit, unit.removesuffix("s")} & {*UNITS_M} and config.height_scale is None:
+    unit = re.sub(r"[\W_]+", " ", text).strip().removesuffix("s")
+    unit_m = UNITS_M.get(unit, 1.0)
+    if unit and unit not in UNITS_M and config.height_scale is None:
         found = f"heights in {text[:40]!r}, an unknown unit"
         raise TerrainError(f"terrain {config.source} has {found}; set terrain.height_scale (metres in one of it)")
     if unit_m != 1.0:
         factor, offset = factor * unit_m, offset * unit_m
-        notes.append(f"heights are in {unit}, put into metres")
+        notes.append(f"heights are in {text}, put into metres")
     elif not unit and config.height_scale is None and crs.is_projected and crs.linear_units_factor[1] != 1.0:
         name, metres = crs.linear_units_factor
         notes.append(

@@ -11,7 +11,6 @@ import io
 import itertools
 import math
 import re
-import warnings
 import zipfile
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
@@ -27,7 +26,7 @@ from rasterio import CRS
 from rasterio.transform import from_origin
 
 from shared_map.importers.georeference import METRES, check_size
-from shared_map.importers.raster_files import LONGEST_REASON, Numbers
+from shared_map.importers.raster_files import LONGEST_REASON, Numbers, faults_of
 from swarm.config.explain import explain
 from swarm.config.input_files import FileKind, check_bytes, read_lines, read_text, size
 from swarm.errors import TerrainError
@@ -67,14 +66,12 @@ def read_npz(path: Path, what: str) -> Numbers:
         held = ", ".join(sorted([*arrays, *unread])) or "nothing"
         raise TerrainError(f"{what} has no `elevation` (read: {_READ_ARRAYS}); it has {held}")
     if heights.ndim != 2 or heights.size == 0 or heights.dtype.kind not in "iuf":
-        raise TerrainError(
-            f"{what}: elevation is {heights.shape} {heights.dtype}; expected numbers in 2 dimensions"
-        )
+        raise TerrainError(f"{what}: elevation is {heights.shape} {heights.dtype}; expected rows of numbers")
     check_size(heights.shape[0], heights.shape[1], what)
     ignored = [f"! not read: the arrays {', '.join(unread)} (read: {_READ_ARRAYS})"] * bool(unread)
     heights, notes = heights.astype(np.float32), ("arrays of NumPy", *ignored)
     try:
-        numbers = {name: float(array) for name, array in arrays.items()}
+        numbers = {name: float(array.item()) for name, array in arrays.items()}
     except (TypeError, ValueError) as error:
         raise TerrainError(f"{what}: its cell size is no single number: {error}") from error
     for name in {"resolution_m", "dx", "dy"} & numbers.keys():
@@ -95,20 +92,15 @@ def _members(path: Path, what: str) -> tuple[dict[str, NDArray[Any]], list[str]]
     """The arrays of `_NPZ_ARRAYS` in an .npz, and the names of others, which are never unpacked."""
     kind = FileKind.ARRAYS
     check_bytes(path, kind)
-    try:
-        with _ShortReads(path) as file, np.load(file, max_header_size=_HEADER_BYTES) as archive:
-            wanted = [name for name in _NPZ_ARRAYS if name in archive.files]
-            total = sum(archive.zip.getinfo(f"{name}.npy").file_size for name in wanted)
-            if total > kind.most_bytes:
-                most = size(kind.most_bytes)
-                raise kind.refusal(path, f"its arrays would unpack to {size(total)}; at most {most} are read")
-            unread = sorted(set(archive.files) - {*_NPZ_ARRAYS, "xmax"})
-            return {name: archive[name] for name in wanted}, [name[:40] for name in unread[:_SHOWN_MEMBERS]]
-    except (TerrainError, OSError):
-        raise
-    except Exception as error:  # of damaged headers numpy raises whatever it runs into
-        why = str(error).partition("\n")[0][:LONGEST_REASON]
-        raise TerrainError(f"{what} is truncated or no .npz of numbers: {why}") from error
+    faults = faults_of(f"{what} is truncated or no .npz of numbers")
+    with faults, _ShortReads(path) as file, np.load(file, max_header_size=_HEADER_BYTES) as archive:
+        wanted = [name for name in _NPZ_ARRAYS if name in archive.files]
+        total = sum(archive.zip.getinfo(f"{name}.npy").file_size for name in wanted)
+        if total > kind.most_bytes:
+            most = size(kind.most_bytes)
+            raise kind.refusal(path, f"its arrays would unpack to {size(total)}; at most {most} are read")
+        unread = sorted(set(archive.files) - {*_NPZ_ARRAYS, "xmax"})
+        return {name: archive[name] for name in wanted}, [name[:40] for name in unread[:_SHOWN_MEMBERS]]
 
 
 class _ShortReads(io.FileIO):
@@ -185,7 +177,7 @@ def read_ros(path: Path) -> Numbers:
     """
     try:
         raw = yaml.safe_load(read_text(path, FileKind.ROS_MAP))
-        found = msgspec.convert(raw, _RosMap, strict=False)
+        found = msgspec.convert(raw if isinstance(raw, dict) else {}, _RosMap, strict=False)
     except msgspec.ValidationError as error:
         raise TerrainError(f"terrain {path} is no ROS map: {explain(str(error), raw, _RosMap, 'map')}") from error
     except (yaml.YAMLError, ValueError, RecursionError) as error:
@@ -230,18 +222,15 @@ def _grey(path: Path) -> tuple[NDArray[np.float32], int]:
         If the file cannot be read, is no such image, or is shorter than its header says.
     """
     check_bytes(path, FileKind.IMAGE)
-    try:
-        with warnings.catch_warnings(action="ignore"), Image.open(path, formats=("PPM", "PNG", "BMP")) as image:
-            check_size(image.height, image.width, f"image {path}")
-            if image.mode in ("L", "I", "I;16"):
-                return np.asarray(image, np.float32), 255 if image.mode == "L" else 65535
-            colours = np.asarray(image.convert("RGBA"), np.float32)
-    except (OSError, ValueError, OverflowError, SyntaxError, Image.DecompressionBombError) as error:
-        raise TerrainError(f"image {path} is truncated or no PGM, PNG or BMP: {str(error)[:200]}") from error
+    faults = faults_of(f"image {path} is truncated or no PGM, PNG or BMP")
+    with faults, Image.open(path, formats=("PPM", "PNG", "BMP")) as image:
+        check_size(image.height, image.width, f"image {path}")
+        if image.mode in ("L", "I", "I;16"):
+            return np.asarray(image, np.float32), 255 if image.mode == "L" else 65535
+        colours = np.asarray(image.convert("RGBA"), np.float32)
     return np.where(colours[..., 3] > 0, colours[..., :3].mean(axis=-1), np.float32(np.nan)), 255
 
 
-_KIND = FileKind.POINTS
 _LINES, _LONGEST = 10_000, 4096
 """Lines that are read at once, and bytes of the longest: 40 MB."""
 _MOST_STEPS = 1 << 20
@@ -337,7 +326,8 @@ def _points_of(path: Path, what: str) -> tuple[Callable[[], Iterator[Points]], b
     if not first:
         raise TerrainError(f"{what} holds no numbers")
     mark = next((each for each in ";\t," if each in first), None)
-    words = [word.strip(" \"'").lower() for word in first.split(mark)]
+    decimal = "," if mark in (";", "\t") else "."
+    words = [word.strip(" \"'").lower() for word in first.replace(decimal, ".").split(mark)]
     header, columns, is_degrees = 0, (0, 1, 2), False
     try:
         np.array([word or "nan" for word in words], np.float64)
@@ -352,7 +342,7 @@ def _points_of(path: Path, what: str) -> tuple[Callable[[], Iterator[Points]], b
     empty = None if mark is None else re.compile(f"(?:(?<={mark})|^) *(?={mark}|$)")
 
     def numbers_of(lines: Iterable[str]) -> Points:
-        filled = lines if empty is None else [empty.sub("nan", line) for line in lines]
+        filled = lines if empty is None else [empty.sub("nan", each.replace(decimal, ".")) for each in lines]
         return np.loadtxt(filled, np.float64, delimiter=mark, usecols=columns, ndmin=2, comments=None)
 
     def points() -> Iterator[Points]:
@@ -374,7 +364,7 @@ def _points_of(path: Path, what: str) -> tuple[Callable[[], Iterator[Points]], b
 
 def _lines(path: Path) -> Iterator[tuple[int, str]]:
     """(number, line) of those that are neither empty nor a comment."""
-    stripped = ((n, line.strip(" ")) for n, line in enumerate(read_lines(path, _KIND, _LONGEST), 1))
+    stripped = ((n, line.strip(" ")) for n, line in enumerate(read_lines(path, FileKind.POINTS, _LONGEST), 1))
     return ((n, line) for n, line in stripped if line and not line.startswith("#"))
 
 

@@ -10,14 +10,12 @@ import codecs
 import contextlib
 import glob
 import itertools
-import lzma
 import math
 import os
 import re
 import tomllib
 import warnings
 import zipfile
-import zlib
 from collections.abc import Collection, Iterator, Sequence
 from contextlib import contextmanager
 from functools import partial
@@ -31,17 +29,15 @@ from numpy.typing import NDArray
 from shared_map.array_files import Floats
 from shared_map.terrain.row_bands import bands
 from swarm.config.input_files import FileKind, check_bytes, check_file, size
-from swarm.errors import TerrainError
+from swarm.errors import SwarmError, TerrainError
 from swarm.grid import MAX_CELLS, GridSpec
 
 _FORMATS = tomllib.loads((Path(__file__).parent / "formats.toml").read_text(encoding="utf-8"))
-_OTHERS, _CONVERSIONS = _FORMATS.pop("others"), _FORMATS.pop("conversions")
+_OTHERS, _CONVERSIONS, DRAWINGS = (_FORMATS.pop(name) for name in ("others", "conversions", "drawings"))
 _DRIVERS = {first.encode("latin-1"): key for key, row in _FORMATS.items() for first in row.get("begins", ())}
 DRIVERS_BY_ENDING = {ending: key for key, row in _FORMATS.items() for ending in row.get("endings", ())}
-_NAMELESS, _ZIPPED = (
-    {ending: key for ending, key in DRIVERS_BY_ENDING.items() if _FORMATS[key].get(kind)}
-    for kind in ("nameless", "zipped")
-)
+_NAMELESS = {ending: key for ending, key in DRIVERS_BY_ENDING.items() if "nameless" in _FORMATS[key]}
+_ZIPPED = tuple(ending for ending, key in DRIVERS_BY_ENDING.items() if "zipped" in _FORMATS[key])
 _HEADER_WORD = re.compile(rb"\W*(?!(nan|inf|infinity)$)[a-z_]+", re.IGNORECASE)
 """The first word of a line of the header of a grid as text; a value follows. Surfer's has lines of numbers."""
 _NUMBER = re.compile(rb"[-+]?((\d+\.?\d*|\.\d+)(e[-+]?\d+)?|inf|infinity|nan)", re.IGNORECASE)
@@ -61,11 +57,6 @@ NOTES = "NOTES"
 PLAIN = {".npz": "read_npz", ".csv": "read_text_grid", ".xyz": "read_text_grid"}
 """Endings of files whose numbers GDAL does not read, or not as they are (docs/design/terrain-import.md) -> their
 reader in `plain_grids`, which imports this module."""
-BAD_ARCHIVE = (
-    zipfile.BadZipFile, zlib.error, lzma.LZMAError, NotImplementedError, RuntimeError, EOFError, ValueError,
-    KeyError, OverflowError,
-)  # fmt: skip
-"""Exceptions of zipfile and its unpackers on damaged, encrypted or unknown members."""
 LONGEST_REASON = 200
 """Characters of what a library says that are passed on."""
 READ_ROWS = 512
@@ -116,9 +107,23 @@ def is_raster(path: Path) -> bool:
     with contextlib.suppress(OSError, TerrainError):
         if is_named(path, PLAIN):
             return path.is_file()
-        head, member, _ = beginning(path, tuple(_ZIPPED), FileKind.IMAGE, "")
+        head, member, _ = beginning(path, _ZIPPED, FileKind.IMAGE, "")
         return bool(_driver(head, Path(member or path), ""))
     return False
+
+
+@contextmanager
+def faults_of(what: str) -> Iterator[None]:
+    """Makes what a library raises on a damaged file a TerrainError of one sentence, which `what` begins."""
+    try:
+        with warnings.catch_warnings(action="ignore"):
+            yield
+    except Exception as error:  # libraries raise whatever their own code runs into
+        if isinstance(error, SwarmError | MemoryError) or getattr(error, "errno", None):
+            raise
+        lines = str(error).strip().splitlines() or [type(error).__name__]
+        # After its first sentence, GDAL advises its programmers.
+        raise TerrainError(f"{what}: {lines[0].partition('. ')[0][:LONGEST_REASON]}") from error
 
 
 @contextmanager
@@ -326,7 +331,7 @@ def _kind_of(path: Path, what: str) -> tuple[str | Path, str, int]:
 
     Raises TerrainError on a file that is not a raster; `what` names it. Raises OSError as `open` does.
     """
-    head, member, length = beginning(path, tuple(_ZIPPED), FileKind.IMAGE, what)
+    head, member, length = beginning(path, _ZIPPED, FileKind.IMAGE, what)
     named = path if member is None else Path(member)
     driver = _driver(head, named, what if member is None else f"{what}: {member}")
     if driver == "VRT" and member is not None:
@@ -357,22 +362,19 @@ def beginning(path: Path, endings: Sequence[str], kind: FileKind, what: str) -> 
         head = file.read(_HEAD_BYTES)
     if not head.startswith(b"PK"):
         return head, None, length
-    try:
-        with zipfile.ZipFile(path) as archive:
-            # Finder adds a folder of its own.
-            files = [each for each in archive.infolist() if not re.search(r"^__MACOSX/|/$", each.filename)]
-            named = [each.filename for each in files if Path(each.filename).suffix.lower() in endings]
-            if len(named) != 1:
-                raise TerrainError(f"{what} holds {len(named)} files of the kinds {', '.join(endings)}: unpack it")
-            parts = [each for each in files if Path(each.filename).stem == Path(named[0]).stem]
-            unpacked = sum(each.file_size for each in parts)
-            if unpacked > kind.most_bytes:
-                most = f"at most {size(kind.most_bytes)} are read"
-                raise TerrainError(f"{what}: {named[0]} has {size(unpacked)}, {most}: unpack it, and crop it")
-            with archive.open(named[0]) as member:
-                return member.read(_HEAD_BYTES), named[0], archive.getinfo(named[0]).file_size
-    except BAD_ARCHIVE as error:
-        raise TerrainError(f"{what} is damaged or no .zip: {str(error)[:LONGEST_REASON]}") from error
+    with faults_of(f"{what} is damaged or no .zip"), zipfile.ZipFile(path) as archive:
+        # Finder adds a folder of its own.
+        files = [each for each in archive.infolist() if not re.search(r"^__MACOSX/|/$", each.filename)]
+        named = [each.filename for each in files if Path(each.filename).suffix.lower() in endings]
+        if len(named) != 1:
+            raise TerrainError(f"{what} holds {len(named)} files of the kinds {', '.join(endings)}: unpack it")
+        parts = [each for each in files if Path(each.filename).stem == Path(named[0]).stem]
+        unpacked = sum(each.file_size for each in parts)
+        if unpacked > kind.most_bytes:
+            most = f"at most {size(kind.most_bytes)} are read"
+            raise TerrainError(f"{what}: {named[0]} has {size(unpacked)}, {most}: unpack it, and crop it")
+        with archive.open(named[0]) as member:
+            return member.read(_HEAD_BYTES), named[0], archive.getinfo(named[0]).file_size
 
 
 def _driver(head: bytes, path: Path, what: str) -> str:
@@ -392,10 +394,8 @@ def _check_virtual(path: Path, what: str, known: dict[Path, float], depth: int =
     It names other files: each must be an ordinary one on this machine. GDAL would ask a web server, and wait at a
     pipe for ever. It has no limit of time either, and a megabyte of XML can ask for the same pixels often.
     """
-    try:
+    with faults_of(f"{what} is truncated or no raster"):
         root = ElementTree.fromstring(path.read_bytes())
-    except (ElementTree.ParseError, LookupError, ValueError) as error:
-        raise TerrainError(f"{what} is truncated or no raster: {str(error)[:LONGEST_REASON]}") from error
     nested = 1.0
     for node in root.iter():
         if not node.tag.endswith(("SourceFilename", "SourceDataset")):
@@ -419,15 +419,14 @@ def _check_virtual(path: Path, what: str, known: dict[Path, float], depth: int =
 
 def _painted(root: ElementTree.Element, band: ElementTree.Element) -> float:
     """Returns how many times over the pixels of a band are painted, at least once."""
-    try:
+    with contextlib.suppress(ValueError):  # GDAL states the fault
         cells = max(float(root.get("rasterXSize", 1)) * float(root.get("rasterYSize", 1)), 1.0)
         places = [node.find("DstRect") for node in band if node.tag.endswith("Source")]
         painted = cells * places.count(None)
         for place in places:
             painted += 0 if place is None else abs(float(place.get("xSize", 0)) * float(place.get("ySize", 0)))
-    except ValueError:
-        return 1.0  # GDAL states the fault
-    return max(painted / cells, 1.0)
+        return max(painted / cells, 1.0)
+    return 1.0
 
 
 def other_format(head: bytes, otherwise: str = "") -> str:
@@ -468,7 +467,6 @@ def mask_of(path: Path, grid: GridSpec) -> NDArray[np.bool_]:
     """
     with opened(path, "mask") as dataset:
         if (dataset.height, dataset.width) != (grid.rows, grid.cols):
-            raise TerrainError(
-                f"mask {path} has {dataset.height} x {dataset.width} pixels, the terrain {grid.rows} x {grid.cols}"
-            )
+            found = f"{dataset.height} x {dataset.width} pixels"
+            raise TerrainError(f"mask {path} has {found}, the terrain {grid.rows} x {grid.cols}")
         return np.asarray(dataset.read(1) != 0, np.bool_)

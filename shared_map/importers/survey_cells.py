@@ -151,9 +151,8 @@ def _resampling_of(heights_m: Floats) -> _Resampling | None:
         cells = min(count, int(_TRIED_CELLS * factor))
         start = (count - cells) // 2
         some = lines[start : start + cells]
-        tried = [
-            [_Resampling(1 / factor, phase / _PHASES, kernel) for phase in range(_PHASES)] for kernel in KERNELS
-        ]
+        phases = np.arange(_PHASES) / _PHASES
+        tried = [[_Resampling(1 / factor, phase, kernel) for phase in phases.tolist()] for kernel in KERNELS]
         errors = np.array([[_error(some, each) for each in row] for row in tried])
         kernel, phase = np.unravel_index(errors.argmin(), errors.shape)
         if errors[kernel, phase] > _MAYBE * np.median(errors[kernel]):
@@ -217,9 +216,8 @@ def _refined(lines: _Doubles, found: _Resampling, start: int, cells: int) -> _Re
 
         tries = middle.step + np.array([0, 0.2 / cells, 0]), middle.first + np.array([0, 0, 0.06])
         options: Any = {"initial_simplex": np.column_stack(tries), "maxfev": 50, "xatol": 1e-7}
-        step, first = minimize(
-            error, np.array([middle.step, middle.first]), method="Nelder-Mead", options=options
-        ).x
+        begin_at = np.array([middle.step, middle.first])
+        step, first = minimize(error, begin_at, method="Nelder-Mead", options=options).x
         found = _Resampling(float(step), float(first), kernel).moved(-cells / 2)
         if cells >= min(count, _LONGEST):
             break

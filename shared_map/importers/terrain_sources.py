@@ -89,9 +89,8 @@ def load_source(config: TerrainConfig, seed: int, progress: Progress = no_progre
     if config.photo is not None:
         from shared_map.importers.cover.photos import read_photo
 
-        source = with_photo(
-            source, read_photo(Path(config.photo), source.grid, config.crs, progress), config, progress
-        )
+        photo = read_photo(Path(config.photo), source.grid, config.crs, progress)
+        source = with_photo(source, photo, config, progress)
     elif config.labels is not None:
         raise TerrainError(f"terrain.labels = {config.labels!r} needs a photo to learn from; set terrain.photo")
     source = with_water(source, config)
@@ -150,9 +149,7 @@ def _map(path: Path, config: TerrainConfig) -> Source:
     place = found.transform or from_origin(0.0, 0.0, side_m, side_m)
     resolution_m = float(place.a)
     if config.resolution_m is not None and abs(config.resolution_m - resolution_m) > 1e-9:
-        raise TerrainError(
-            f"terrain {path} cannot be resampled without closing gaps; leave terrain.resolution_m out"
-        )
+        raise TerrainError(f"terrain {path}: to resample it would close gaps; leave terrain.resolution_m out")
     factor = found.numbers
     factor[np.isnan(factor)] = 1.0 if config.nodata == "fill" else np.inf
     grid = GridSpec(factor.shape[0], factor.shape[1], resolution_m, place.c, place.f)
@@ -179,9 +176,7 @@ def without_voids(source: Source, config: TerrainConfig) -> Source:
     """Voids counted, and filled if asked for; nothing is done in silence."""
     from shared_map.importers.water_and_voids import clear_voids, fill_voids
 
-    elevation_m = source.elevation_m
-    if not elevation_m.flags.writeable:
-        elevation_m = elevation_m.copy()
+    elevation_m = np.require(source.elevation_m, requirements="W")
     some_m = elevation_m[::_SOME, ::_SOME].copy()
     count = clear_voids(elevation_m)
     if count == 0:
@@ -189,9 +184,8 @@ def without_voids(source: Source, config: TerrainConfig) -> Source:
     share = count / elevation_m.size
     if share == 1.0 and np.isfinite(some_m).any():
         found = f"{np.nanmin(some_m):g} to {np.nanmax(some_m):g}"
-        raise TerrainError(
-            f"terrain {config.source} has heights of {found} m: of centimetres set terrain.height_scale = 0.01"
-        )
+        how = "of centimetres set terrain.height_scale = 0.01"
+        raise TerrainError(f"terrain {config.source} has heights of {found} m: {how}")
     if share == 1.0:
         raise TerrainError(f"terrain {config.source} has no heights at all: every cell is void, NaN or infinite")
     if config.nodata == "fill":

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import math
 import reprlib
 from collections.abc import Callable, Iterable
@@ -11,7 +10,7 @@ from textwrap import shorten
 from typing import Any
 
 from swarm.errors import ConfigError, missing
-from swarm.grid import GridSpec, whole
+from swarm.grid import GridSpec, real, whole
 from swarm.places import Given, cell_of, written
 from swarm.wire.messages.processes import RunInfo
 
@@ -146,7 +145,7 @@ def checked_cells(frame: Frame, cells: Iterable[int]) -> list[int]:
 
 def number(name: str, value: Any) -> float:
     """Converts a program's number to a float. Raises ConfigError on anything else, such as text or truth."""
-    if not isinstance(value, str | bytes | bool) and str(getattr(value, "dtype", "")) != "bool":
-        with contextlib.suppress(TypeError, ValueError, OverflowError):
-            return float(value)
-    raise ConfigError(f"{name} is {reprlib.repr(value)}, expected a number")
+    try:
+        return real(name, value)
+    except TypeError as error:
+        raise ConfigError(str(error)) from None

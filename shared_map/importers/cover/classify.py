@@ -358,9 +358,10 @@ def class_readings(
             readings[row0:row1, part] = ground_readings(features)
             wetness[row0:row1, part] = water_signs(features)
             if resolution_m <= COARSEST_M:
-                strength = _line_strength(rgb, row0, row1, part)
-                strength *= features.grade <= ROAD_GRADE
-                lines[row0:row1, part] = strength
+                above, left = max(row0 - REACH, 0), max(part.start - REACH, 0)
+                strength = line_strength(rgb[above : row1 + REACH, left : part.stop + REACH])
+                strength = strength[row0 - above :, part.start - left :][: row1 - row0, : part.stop - part.start]
+                lines[row0:row1, part] = strength * (features.grade <= ROAD_GRADE)
         np.take(CLASS_OF_READINGS, readings[row0:row1], out=classes[row0:row1])
 
     in_bands(rows, work, "classifying the photo", progress)
@@ -374,13 +375,6 @@ def class_readings(
         readings[~seen] = 0
     readings *= classes == TerrainClass.UNKNOWN
     return ByRules(classes, readings)
-
-
-def _line_strength(rgb: Bytes, row0: int, row1: int, part: slice) -> Bytes:
-    """`line_strength` of a tile, which looks at the cells around it."""
-    above, left = max(row0 - REACH, 0), max(part.start - REACH, 0)
-    strength = line_strength(rgb[above : row1 + REACH, left : part.stop + REACH])
-    return strength[row0 - above :, part.start - left :][: row1 - row0, : part.stop - part.start]
 
 
 def _lakes(wetness: Bytes, elevation_m: Floats, resolution_m: float) -> Bools:
@@ -521,9 +515,8 @@ def held_out(
     true, predicted : uint8 (labelled cells,), TerrainClass
     """
     columns, kinds = _samples(rgb, elevation_m, resolution_m, labels)
-    names, of_cell, cells = np.unique(
-        groups[labels != TerrainClass.UNKNOWN], return_inverse=True, return_counts=True
-    )
+    labelled = groups[labels != TerrainClass.UNKNOWN]
+    names, of_cell, cells = np.unique(labelled, return_inverse=True, return_counts=True)
     parts = min(5, len(names))
     part = np.empty(len(names), np.intp)
     part[np.argsort(-cells, kind="stable")] = np.arange(len(names)) % parts

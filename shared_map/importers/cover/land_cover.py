@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import os
 import tomllib
-from collections.abc import Iterable, Mapping
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -26,6 +26,7 @@ from shared_map.importers.raster_files import opened, sampled
 from shared_map.importers.terrain_sources import Source
 from shared_map.terrain.pace_layers import TerrainClass
 from shared_map.terrain.row_bands import Progress, no_progress
+from swarm.config.explain import nearest
 from swarm.config.ground import TerrainConfig
 from swarm.config.input_files import FileKind, read_text
 from swarm.config.setting_types import CoverGround
@@ -73,19 +74,14 @@ class CoverTable:
     key: str
     title: str
     grounds: Mapping[int, Ground]
-    nothing: frozenset[int] = frozenset((0,))
-    words: tuple[str, ...] = ()
+    nothing: Collection[int] = (0,)
+    words: Sequence[str] = ()
     gappy: bool = True
 
     def replaced(self, own: Mapping[int, Ground]) -> CoverTable:
         """The table with other meanings of some codes."""
-        if not own:
-            return self
-        named = {
-            code: replace(ground, name=self.grounds[code].name) if code in self.grounds else ground
-            for code, ground in own.items()
-        }
-        return replace(self, grounds={**self.grounds, **named}, nothing=self.nothing - own.keys())
+        named = {code: replace(new, name=self.grounds.get(code, new).name) for code, new in own.items()}
+        return replace(self, grounds={**self.grounds, **named}, nothing={*self.nothing} - own.keys())
 
 
 def ground_of(value: CoverGround, name: str = "") -> Ground:
@@ -104,13 +100,10 @@ def _built_in() -> tuple[dict[str, CoverTable], dict[str, frozenset[int]]]:
         key: {int(code): ground_of(value, name) for code, (value, name) in table.pop("grounds", {}).items()}
         for key, table in tables.items()
     }
-    found = {}
     for key, table in tables.items():
-        counted = table.pop("counted", None)
-        of_key = grounds[key] if counted is None else dict(enumerate(grounds[counted].values(), 1))
-        nothing, words = frozenset(table.pop("nothing")), tuple(table.pop("words"))
-        found[key] = CoverTable(key, table.pop("title"), of_key, nothing, words, **table)
-    return found, others
+        if "counted" in table:
+            grounds[key] = dict(enumerate(grounds[table.pop("counted")].values(), 1))
+    return {key: CoverTable(key=key, grounds=grounds[key], **table) for key, table in tables.items()}, others
 
 
 TABLES, OTHERS = _built_in()
@@ -145,21 +138,16 @@ def read_cover_table(path: Path) -> CoverTable:
             raise TerrainError(f"{what}: {cells[0][:40]!r} is no code; expected a whole number to {HIGHEST_CODE}")
         if code in grounds:
             raise TerrainError(f"{what}: code {code} comes twice")
-        # A comma that parts no cells is that of a number: 7;1,7 is a pace of 1.7.
-        grounds[code] = ground_of(_value(cells[1], what), cells[2][:80])
+        try:  # a comma that parts no cells is that of a number: 7;1,7 is a pace of 1.7
+            value: CoverGround = msgspec.convert(cells[1].lower().replace(",", "."), CoverGround, strict=False)
+        except msgspec.ValidationError as error:
+            kinds = ", ".join(kind.name.lower() for kind in TerrainClass)
+            expected = f"expected {kinds}, lethal, or a pace such as 1.5"
+            raise TerrainError(f"{what}: {cells[1][:40]!r} is no ground; {expected}") from error
+        grounds[code] = ground_of(value, cells[2][:80])
     if not grounds:
         raise TerrainError(f"cover codes {path} has no line of code and class")
-    return CoverTable(str(path), f"the codes of {path.name}", grounds, frozenset())
-
-
-def _value(cell: str, what: str) -> CoverGround:
-    try:
-        value: CoverGround = msgspec.convert(cell.lower().replace(",", "."), CoverGround, strict=False)
-    except msgspec.ValidationError as error:
-        kinds = ", ".join(kind.name.lower() for kind in TerrainClass)
-        expected = f"expected {kinds}, lethal, or a pace such as 1.5"
-        raise TerrainError(f"{what}: {cell[:40]!r} is no ground; {expected}") from error
-    return value
+    return CoverTable(str(path), f"the codes of {path.name}", grounds, nothing=())
 
 
 def some(codes: Iterable[int]) -> str:
@@ -205,15 +193,12 @@ def with_cover(source: Source, path: Path, config: TerrainConfig, progress: Prog
     notes = [*source.notes, *cover.notes]
     if wet.any():
         share = f"{wet.mean():.1%} of the terrain is water by photo or heights and ground by the land cover"
-        notes.append(
-            f"{share}, which counts; where it is too coarse for a lake, paint a forbidden zone (cost.zones)"
-        )
+        notes.append(f"{share}, which counts; if too coarse for a lake, paint a forbidden zone (cost.zones)")
     factor = np.where(known, cover.factor, np.float32(1))
     if source.factor is not None:
         factor *= source.factor
-    return replace(
-        source, classes=np.where(known, cover.classes, source.classes), factor=factor, notes=tuple(notes)
-    )
+    classes = np.where(known, cover.classes, source.classes)
+    return replace(source, classes=classes, factor=factor, notes=tuple(notes))
 
 
 def read_cover(path: Path, grid: GridSpec, config: TerrainConfig, progress: Progress = no_progress) -> Cover:
@@ -254,33 +239,23 @@ def read_cover(path: Path, grid: GridSpec, config: TerrainConfig, progress: Prog
             notes.append(f"land cover: {size}, each cell takes the {taken} code")
         if placed.share < 0.999:
             notes.append(f"the land cover's frame covers {placed.share:.1%} of the terrain")
-        kinds, factors, states = _look_up(table)
+        # Class, factor and state of each entry: 0 known, 1 a code that the table lacks, 2 no data.
+        kinds, states = np.zeros(_NOTHING + 1, np.uint8), np.ones(_NOTHING + 1, np.uint8)
+        factors = np.ones(_NOTHING + 1, np.float32)
+        for code, ground in table.grounds.items():
+            if code <= HIGHEST_CODE:
+                kinds[code], factors[code], states[code] = ground.kind, ground.factor, 0
+        states[[code for code in table.nothing if code <= HIGHEST_CODE] + [_NOTHING]] = 2
         classes, factor = np.empty(grid.shape, np.uint8), np.empty(grid.shape, np.float32)
         known = np.empty(grid.shape, np.bool_)
-        counts = np.zeros(HIGHEST_CODE + 3, np.int64)
+        counts = np.zeros(_NOTHING + 1, np.int64)
         for rows, codes in placed.on_grid(how, 1, "reading land cover", progress):
-            at = _entries(codes)
+            # A code itself, `_LARGER` of a larger number, else `_NOTHING`.
+            empty = ~(codes >= 0) | (codes == np.inf)
+            at = np.where(empty, _NOTHING, np.minimum(codes, _LARGER)).astype(np.intp)
             classes[rows], factor[rows], known[rows] = kinds[at], factors[at], states[at] == 0
             counts += np.bincount(at.reshape(-1), minlength=len(counts))
         return Cover(classes, factor, known, (*notes, *_notes_on(what, table, known_by, counts, states)))
-
-
-def _entries(codes: Floats) -> NDArray[np.intp]:
-    """The entry of the look-up for each value: a code itself, `_LARGER` of a larger number, else `_NOTHING`."""
-    empty = ~(codes >= 0) | (codes == np.inf)
-    return np.where(empty, _NOTHING, np.minimum(codes, _LARGER)).astype(np.intp)
-
-
-def _look_up(table: CoverTable) -> tuple[Bytes, Floats, Bytes]:
-    """Class, factor and state of each entry: 0 known, 1 a code that the table lacks, 2 no data."""
-    kinds = np.zeros(HIGHEST_CODE + 3, np.uint8)
-    factors = np.ones(HIGHEST_CODE + 3, np.float32)
-    states = np.ones(HIGHEST_CODE + 3, np.uint8)
-    for code, ground in table.grounds.items():
-        if code <= HIGHEST_CODE:
-            kinds[code], factors[code], states[code] = ground.kind, ground.factor, 0
-    states[[code for code in table.nothing if code <= HIGHEST_CODE] + [_NOTHING]] = 2
-    return kinds, factors, states
 
 
 def _notes_on(
@@ -327,7 +302,8 @@ def meaning_of(dataset: Any, what: str, config: TerrainConfig) -> tuple[CoverTab
     sample = sampled_codes(dataset, what)
     if (name := config.cover_codes) is not None:
         if name not in TABLES and not os.path.isfile(name):  # also of a name that is too long
-            raise TerrainError(f"terrain.cover_codes {name!r} is neither {', '.join(TABLES)} nor a CSV file")
+            near = nearest(name[:60], [*TABLES])
+            raise TerrainError(f"terrain.cover_codes {name!r} is neither {', '.join(TABLES)} nor a CSV file{near}")
         table = TABLES[name] if name in TABLES else read_cover_table(Path(name))
         return table.replaced(own), f"as terrain.cover_codes = {name!r} says"
     only_own = CoverTable("own", "codes of one's own", own), "as terrain.cover_classes says"
@@ -369,11 +345,8 @@ def recognise(dataset: Any, sample: NDArray[Any], what: str) -> tuple[CoverTable
     """
     text, there = text_of(dataset), set(np.unique(sample).tolist())
     every = {key: {*table.grounds, *table.nothing} for key, table in TABLES.items()}
-    fits = [
-        table
-        for key, table in TABLES.items()
-        if there & table.grounds.keys() and np.isin(sample, [*every[key]]).mean() >= _LEAST_KNOWN
-    ]
+    known = {key: np.isin(sample, [*codes]).mean() for key, codes in every.items()}
+    fits = [TABLES[key] for key in TABLES if there & TABLES[key].grounds.keys() and known[key] >= _LEAST_KNOWN]
     # Whole numbers from 1 on, in colours, are anybody's codes.
     has_palette = dataset.colorinterp[0] == ColorInterp.palette
     by_codes = [table for table in fits if there <= every[table.key] and (table.gappy or not has_palette)]
@@ -388,7 +361,6 @@ def recognise(dataset: Any, sample: NDArray[Any], what: str) -> tuple[CoverTable
             keys = " or ".join(repr(table.key) for table in chosen)
             titles = ", and of ".join([*(table.title for table in chosen), *others])
             csv = ", or a CSV file of code and class" if others else ""
-            raise TerrainError(
-                f"{what}: its codes ({some(there)}) are those of {titles}; set terrain.cover_codes = {keys}{csv}"
-            )
+            found = f"its codes ({some(there)}) are those of {titles}"
+            raise TerrainError(f"{what}: {found}; set terrain.cover_codes = {keys}{csv}")
     return None

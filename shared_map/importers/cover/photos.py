@@ -135,9 +135,7 @@ def _stretch(dataset: Any, indexes: list[int], notes: list[str], what: str) -> t
         return 0.0, 1.0
     if sample.min() in CODES and sample.min() < 0:
         void = f"{sample.min():g}"
-        raise TerrainError(
-            f"{what} holds {void}, which is no brightness: gdal_edit.py -a_nodata {void} declares it"
-        )
+        raise TerrainError(f"{what} holds {void}, no brightness: gdal_edit.py -a_nodata {void} declares it")
     low, high = (float(value) for value in np.percentile(sample, (2, 98)))
     notes.append(f"photo stretched from {low:.4g}..{high:.4g} to bytes")
     return low, max(high, low + 1e-9)

@@ -133,11 +133,8 @@ class Placing:
                 )
             for n in np.flatnonzero(bounds[:, 2] - bounds[:, 0] > 180):
                 if _jumps(features.shapes[n]):
-                    raise unusable(
-                        what,
-                        features.id(features.of[n]),
-                        "an edge of it spans more than 180 degrees: cut it at 180",
-                    )
+                    why = "an edge of it spans more than 180 degrees: cut it at 180"
+                    raise unusable(what, features.id(features.of[n]), why)
         for n in np.flatnonzero(self._reversed(bounds)) if self._touched or self._on(bounds).any() else ():
             raise unusable(what, features.id(features.of[n]), "it is on the terrain only if x and y change places")
 
@@ -155,9 +152,8 @@ class Placing:
             self._features += len(np.unique(features.of[near]))
             self._corners += int(shapely.get_num_coordinates(features.shapes[near]).sum())
             if self._features > MOST_FEATURES or self._corners > MOST_CORNERS:
-                raise TerrainError(
-                    f"{self._layer.what} has over {MOST_FEATURES} features or {MOST_CORNERS} corners; simplify it"
-                )
+                most = f"{MOST_FEATURES} features or {MOST_CORNERS} corners"
+                raise TerrainError(f"{self._layer.what} has over {most}; simplify it")
             shapes, of, mended = _mended(features, near, self._layer.what)
             placed = [self._placed(shapes, of, shift, features) for shift in self._shifts]
         self._facts.features += len(features.numbers)
@@ -338,9 +334,7 @@ def _parts(shape: Any) -> list[Any]:
     if shape.geom_type != "Polygon" or not heavy or south - north < 2:
         return [shape]
     middle = float(np.floor((north + south) / 2))
-    halves = [
-        shapely.clip_by_rect(shape, west - 1, top, east + 1, bottom)
-        for top, bottom in ((north - 1, middle), (middle, south + 1))
-    ]
+    rows = ((north - 1, middle), (middle, south + 1))
+    halves = [shapely.clip_by_rect(shape, west - 1, top, east + 1, bottom) for top, bottom in rows]
     pieces = (piece for half in halves for piece in shapely.get_parts(half))
     return [part for piece in pieces if piece.geom_type == "Polygon" for part in _parts(piece)]

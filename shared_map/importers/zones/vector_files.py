@@ -11,7 +11,7 @@ import contextlib
 import io
 import math
 import re
-import warnings
+import tempfile
 import zipfile
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -29,16 +29,20 @@ from numpy.typing import NDArray
 from pyogrio.raw import read
 
 from shared_map.importers.georeference import system_named
-from shared_map.importers.raster_files import LONGEST_REASON, beginning, number_of, other_format
+from shared_map.importers.raster_files import DRAWINGS, beginning, faults_of, number_of, other_format
 from shared_map.importers.zones.zone_files import IN_ARCHIVES, Kind, kind_of
 from swarm.config.explain import nearest
 from swarm.config.input_files import FileKind, check_bytes, read_bytes, size
-from swarm.errors import SwarmError, TerrainError
+from swarm.errors import TerrainError
 
 _CHUNK = 100_000
 """Features which are read at once."""
-_TOGETHER = {"LIBKML": None, "GPX": {"waypoints", "routes", "tracks"}, "OSM": {"points", "lines", "multipolygons"}}
-"""Formats whose layers are one drawing, and the layers which hold it; None: all."""
+_TOGETHER = DRAWINGS["together"]
+_OPTIONS = {
+    "OSM_USE_CUSTOM_INDEXING": "NO",  # which takes new, negative ids for damage
+    "OSM_MAX_TMPFILE_SIZE": "1",  # MB, which each opening clears: 0.06 s; the 100 of GDAL take 0.35 s
+    "CPL_TMPDIR": tempfile.gettempdir(),  # otherwise the folder of the user
+}
 _IDS = ("id", "@id", "osm_id", "osm_way_id", "full_id")
 _POLYGONS = 3
 """shapely's number of a polygon: those of collections are higher."""
@@ -101,8 +105,9 @@ def open_layers(path: Path, layer: str | None, what: str) -> list[Layer]:
     another kind, or holds several layers and none is named.
     """
     source, kind = _source(path, what)
-    pyogrio.set_gdal_config_options({"OSM_USE_CUSTOM_INDEXING": "NO"})  # which takes new, negative ids for damage
-    with _refused(what):
+    pyogrio.set_gdal_config_options(_OPTIONS)
+    least = _check_index(path, source, what) if kind.driver == "ESRI Shapefile" else 0
+    with faults_of(f"{what} is damaged"):
         listed = pyogrio.list_layers(source)
         known = [str(name) for name, shape in listed if shape is not None]
         if not known:
@@ -112,7 +117,7 @@ def open_layers(path: Path, layer: str | None, what: str) -> list[Layer]:
             raise TerrainError(f"{what} has no layer {layer!r}, only {shown}{nearest(layer, known)}")
         names = [layer] if layer is not None else known
         if layer is None and kind.driver in _TOGETHER:
-            names = [name for name in known if name in (_TOGETHER[kind.driver] or known)]
+            names = [name for name in known if name in _TOGETHER[kind.driver] or not _TOGETHER[kind.driver]]
         elif len(names) > 1:
             raise TerrainError(f"{what} has {len(known)} layers; set layer to one of {shown}")
         found = []
@@ -121,14 +126,11 @@ def open_layers(path: Path, layer: str | None, what: str) -> list[Layer]:
                 quoted = name.replace("'", "''")
                 held = read(source, sql=f"SELECT type FROM sqlite_master WHERE name = '{quoted}'")[3][0]
                 if held.tolist() not in ([], ["table"]):
-                    raise TerrainError(
-                        f"{what}: layer {name!r} is a {held[0]}, expected a table; ogr2ogr makes a copy of it"
-                    )
+                    found_is = f"is a {held[0]}, expected a table; ogr2ogr makes a copy of it"
+                    raise TerrainError(f"{what}: layer {name!r} {found_is}")
             index = listed[:, 0].tolist().index(name)
             info = pyogrio.read_info(source, layer=index, force_feature_count=True)
-            count = int(info["features"])
-            if kind.driver == "ESRI Shapefile":
-                count = max(count, _check_index(path, source, what))  # GDAL believes the header of the index
+            count = max(int(info["features"]), least)  # GDAL believes the header of the index
             columns = tuple(str(field) for field in info["fields"])
             found.append(Layer(source, what, index, name, str(info["crs"] or ""), columns, count))
         return found
@@ -142,7 +144,7 @@ def read_features(layer: Layer, columns: Sequence[str]) -> Iterator[Features]:
     """
     wanted = [name for name in dict.fromkeys((*columns, *_IDS)) if name in layer.columns]
     for first in range(0, 1 << 31, _CHUNK):
-        with _refused(layer.what), np.errstate(all="ignore"):
+        with faults_of(f"{layer.what} is damaged"), np.errstate(all="ignore"):
             part = {"layer": layer.index, "columns": wanted, "skip_features": first, "max_features": _CHUNK}
             meta, numbers, stored, fields = read(layer.source, force_2d=True, return_fids=True, **part)
             geometries = shapely.from_wkb(stored, on_invalid="ignore")
@@ -162,10 +164,8 @@ def read_features(layer: Layer, columns: Sequence[str]) -> Iterator[Features]:
             raise unusable(layer.what, features.id(n), why)
         yield features
         if len(numbers) < _CHUNK:
-            if first + len(numbers) != layer.count:
-                raise TerrainError(
-                    f"{layer.what} is damaged: of its {layer.count} features {first + len(numbers)} are read"
-                )
+            if (count := first + len(numbers)) != layer.count:
+                raise TerrainError(f"{layer.what} is damaged: of its {layer.count} features {count} are read")
             return
 
 
@@ -184,21 +184,6 @@ def parts_of(geometries: NDArray[Any]) -> tuple[NDArray[Any], NDArray[np.int64]]
     order = np.argsort(of, kind="stable")
     present = order[~shapely.is_missing(parts[order])]
     return parts[present], of[present]
-
-
-@contextlib.contextmanager
-def _refused(what: str) -> Iterator[None]:
-    """Makes what GDAL says a TerrainError of one sentence."""
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")
-            yield
-    except (SwarmError, MemoryError):
-        raise
-    except Exception as error:  # of damaged files pyogrio raises whatever its own code runs into
-        lines = str(error).strip().splitlines() or [type(error).__name__]
-        # After its first sentence, GDAL advises its programmers.
-        raise TerrainError(f"{what} is damaged: {lines[0].partition('. ')[0][:LONGEST_REASON]}") from error
 
 
 # --- which file ---------------------------------------------------------------------------------------------
@@ -220,7 +205,7 @@ def _source(path: Path, what: str) -> tuple[str | bytes, Kind]:
         raise TerrainError(f"{what} {other_format(head, f'is neither {neither}, nor a .zip of one')}")
     absolute = path.resolve()
     source = str(absolute) if member is None else f"/vsizip/{{{absolute}}}/{member}"
-    if kind.text is None:
+    if not kind.text:
         return f"GPKG:{source}" if kind.driver == "GPKG" and member is None else source, kind
     if member is not None and length > FileKind.VECTOR_TEXT.most_bytes:
         raise FileKind.VECTOR_TEXT.refusal(path, f"{member} has {size(length)}")
@@ -241,6 +226,9 @@ def _check_index(path: Path, source: str | bytes, what: str) -> int:
             with contextlib.suppress(KeyError, TerrainError):  # there is no such part
                 inner = str(Path(member).with_suffix(name)) if member else None
                 part = _read(path if member else path.with_suffix(name), inner, FileKind.VECTORS)
+        if not part:
+            lacking = Path(member or path).with_suffix(ending).name
+            raise TerrainError(f"{what} lacks {lacking}, its index: copy it, too, or ask for a GeoPackage")
         parts.append(np.frombuffer(part, np.uint8))
     shapes, index = parts
     at, length = 2 * index[100:][: len(index[100:]) // 8 * 8].view(">i4").reshape(-1, 2).T.astype(np.int64)
@@ -329,13 +317,9 @@ class _Document(Struct, frozen=True):
     fileType: str = ""  # noqa: N815
 
 
-_document = msgspec.json.Decoder(_Document)
 _feature = msgspec.json.Decoder(Feature | Geometry)
-_lines = msgspec.json.Decoder(msgspec.Raw)
 _LOOKED_AT = 4096
 """Bytes in which the beginning of another format is looked for."""
-_RECORD = b"\x1e"
-"""The sign before each feature of a GeoJSON text sequence."""
 
 
 INCLUSION = "inclusion"
@@ -350,18 +334,22 @@ def checked_json(data: bytes, kind: Kind, what: str, name: str) -> bytes:
 
     Raises TerrainError with one sentence, which names the first feature that cannot be read.
     """
-    number, text = 0, data.removeprefix(b"\xef\xbb\xbf").replace(_RECORD, b"")
+    # Of a GeoJSON text sequence each feature begins with the sign 1E.
+    number, text = 0, data.removeprefix(b"\xef\xbb\xbf").replace(b"\x1e", b"")
     try:
         if kind.text == "fence":
             return _collection(fence_of_waypoints(text.decode("ascii")), name)
         try:
-            document = _document.decode(text)
+            document = msgspec.json.decode(text, type=_Document)
         except msgspec.DecodeError as error:
             if "trailing characters" not in str(error):
                 raise
-            document = _Document(features=_lines.decode_lines(text))
+            document = _Document(features=msgspec.json.Decoder(msgspec.Raw).decode_lines(text))
         if document.fileType:
-            return _collection(fence_of_plan(text), name)
+            fence = msgspec.json.decode(text, type=_Plan).geoFence
+            areas = [_area(each.polygon, each.inclusion) for each in fence.polygons]
+            discs = [_disc(each.circle.center, each.circle.radius, each.inclusion) for each in fence.circles]
+            return _collection([*areas, *discs], name)
         if document.type == "FeatureCollection" and not document.features:
             raise TerrainError(f"{what} holds no feature")
         if document.crs is not None:
@@ -384,15 +372,7 @@ def checked_json(data: bytes, kind: Kind, what: str, name: str) -> bytes:
 # --- XML ----------------------------------------------------------------------------------------------------
 
 
-_ONE_OF = {
-    "Placemark": ("Point", "LineString", "LinearRing", "Polygon", "MultiGeometry", "Track", "MultiTrack", "Model"),
-    "Polygon": ("outerBoundaryIs",),
-    **dict.fromkeys(("outerBoundaryIs", "innerBoundaryIs"), ("LinearRing",)),
-    **dict.fromkeys(("Point", "LineString", "LinearRing"), ("coordinates",)),
-}
-"""Elements of KML, and what each holds once."""
-_AREA_TAGS = {("natural", "water"), ("landuse", "reservoir"), ("landuse", "basin")}
-"""Tags of OpenStreetMap that only areas of water have."""
+_ONE_OF, _AREA_TAGS = DRAWINGS["kml_one_of"], DRAWINGS["osm_areas"]
 
 
 def checked_xml(data: bytes, what: str) -> None:
@@ -402,7 +382,7 @@ def checked_xml(data: bytes, what: str) -> None:
     """
     if b"<OGR" in data or b"<VRT" in data:
         raise TerrainError(f"{what} names other files, which are not read")
-    ends: dict[str | None, tuple[str | None, str | None]] = {}
+    ends: dict[str | None, list[str | None]] = {}
     rings: dict[str | None, list[str | None]] = {}
     open_areas: set[str | None] = set()
     known: set[tuple[str, str | None]] = set()
@@ -425,34 +405,31 @@ def checked_xml(data: bytes, what: str) -> None:
                         continue
                 raise TerrainError(f"{what} is damaged: {name} holds {','.join(place)[:60]!r}, expected numbers")
             held = [inner.tag.rpartition("}")[2] for inner in element]
-            parts = _ONE_OF.get(name, ())
-            if parts and (count := sum(map(held.count, parts))) != 1:  # of several, GDAL reads the last
-                raise TerrainError(f"{what} is damaged: a {name} holds {count} of {', '.join(parts)}, expected one")
+            one_of = _ONE_OF.get(name, ())
+            if one_of and (count := sum(map(held.count, one_of))) != 1:  # of several, GDAL reads the last
+                raise TerrainError(f"{what} is damaged: a {name} has {count} of {', '.join(one_of)}, expected one")
             if name == "rotation" and number_of(element.text or "0"):  # GDAL reads the overlay as if it were not
                 raise TerrainError(f"{what} has a turned overlay, which is not read; draw its area")
             if name == "NetworkLink":
                 raise TerrainError(f"{what} has a NetworkLink, which is not followed; save its areas in one file")
-            if name == "way":
-                nodes = [inner.get("ref") for inner in element if inner.tag == "nd"]
-                if len(nodes) == 1:
-                    raise TerrainError(f"{what} is damaged: way {element.get('id')} has one node; repair it")
-                if nodes:
-                    ends[element.get("id")] = nodes[0], nodes[-1]
-                if (
-                    nodes
-                    and nodes[0] != nodes[-1]
-                    and any((tag.get("k"), tag.get("v")) in _AREA_TAGS for tag in element)
-                ):
-                    open_areas.add(element.get("id"))
-            if name == "relation" and _is_area(element):
-                ways = [inner.get("ref") for inner in element if inner.get("type") == "way"]
-                rings[element.get("id")] = ways
+            id, tags = element.get("id"), _AREA_TAGS.get(name, ())
+            if element.get("action") == "delete" or element.get("visible") == "false":
+                raise TerrainError(f"{what}: {name} {id} is deleted, but still in the file; download the area anew")
+            is_area = any([inner.get("k"), inner.get("v")] in tags for inner in element)
             if name in ("node", "way"):
-                known.add((name, element.get("id")))
-            for inner in element if name in ("way", "relation") else ():
-                kind = {"nd": "node", "member": inner.get("type")}.get(inner.tag)
-                if kind in ("node", "way") and (name == "way" or _is_area(element)):
-                    needed[kind, inner.get("ref")] = f"{name} {element.get('id')}"
+                known.add((name, id))
+            if name == "way" or is_area:
+                parts = [(inner.get("type", "node"), inner.get("ref")) for inner in element if inner.tag != "tag"]
+                needed |= {part: f"{name} {id}" for part in parts if part[0] in ("node", "way")}
+                refs = [ref for kind, ref in parts if kind == ("node" if name == "way" else "way")]
+            if name == "way":
+                if len(refs) == 1:
+                    raise TerrainError(f"{what} is damaged: way {id} has one node; repair it")
+                ends[id] = refs[:1] + refs[-1:]
+                if is_area and refs[:1] != refs[-1:]:
+                    open_areas.add(id)
+            elif is_area:
+                rings[id] = refs
             if name not in ("nd", "member", "tag"):
                 element.clear()
     except ElementTree.ParseError as error:
@@ -464,12 +441,7 @@ def checked_xml(data: bytes, what: str) -> None:
         if any(count % 2 for count in met.values()):  # GDAL leaves it out
             raise TerrainError(f"{what}: relation {area} cannot be used: its ways form no closed ring; repair it")
     for absent in needed.keys() - known:
-        user = needed[absent]
-        raise TerrainError(f"{what} is not complete: {user} needs {absent[0]} {absent[1]}")
-
-
-def _is_area(relation: ElementTree.Element) -> bool:
-    return any(tag.get("k") == "type" and tag.get("v") in ("multipolygon", "boundary") for tag in relation)
+        raise TerrainError(f"{what} is not complete: {needed[absent]} needs {absent[0]} {absent[1]}")
 
 
 # --- fences of ground stations ------------------------------------------------------------------------------
@@ -497,13 +469,6 @@ class _Fence(Struct, frozen=True):
 
 class _Plan(Struct, frozen=True):
     geoFence: _Fence  # noqa: N815
-
-
-def fence_of_plan(data: bytes) -> list[dict[str, Any]]:
-    """The fence of a QGroundControl .plan as features of a GeoJSON."""
-    fence = msgspec.json.decode(data, type=_Plan).geoFence
-    areas = [_area(each.polygon, each.inclusion) for each in fence.polygons]
-    return areas + [_disc(each.circle.center, each.circle.radius, each.inclusion) for each in fence.circles]
 
 
 def fence_of_waypoints(text: str) -> list[dict[str, Any]]:

@@ -43,17 +43,14 @@ class Way:
 _TABLES = tomllib.loads((Path(__file__).parent / "ways.toml").read_text(encoding="utf-8"))
 _EXTENTS: Mapping[str, Sequence[float]] = _TABLES.pop("extents")
 """Columns for the extent of points and lines, in any letter case -> (width / value, largest width in metres)."""
+COLUMNS: Mapping[Kind, Sequence[str]] = _TABLES.pop("columns")
+"""Columns of the class, by the kind of zone."""
 
 
 BUILT_IN: Mapping[str, Mapping[str, Way]] = {
     kind: {name: Way(width_m, None if factor == "lethal" else factor) for name, (width_m, factor) in rows.items()}
     for kind, rows in _TABLES.items()
 }
-COLUMNS: Mapping[Kind, tuple[str, ...]] = {
-    "road": ("highway", "fclass"),
-    "water": ("waterway", "natural", "landuse", "fclass"),
-}
-"""Columns of the class: OSM's own keys, and the one of extracts as Shapefiles."""
 TAGS = ("bridge", "tunnel", "area", "inclusion")
 PACKED = ("other_tags", "tags")
 """Columns that hold further tags: as GDAL writes them, or JSON."""
@@ -69,15 +66,10 @@ _UNITS_M = {"km": 1000.0, "ft": 0.3048, "feet": 0.3048, "'": 0.3048}
 def unpacked(row: Mapping[str, str]) -> dict[str, str]:
     """Returns the tags of a feature: its columns, and those that are packed into one. A column of its own counts
     more."""
-    tags: dict[str, str] = {}
-    packed = row.get("tags")
-    if packed is not None and packed.startswith("{"):
-        try:
-            known = json.loads(packed)
-        except (ValueError, RecursionError):
-            known = {}
-        tags |= {str(key): str(value) for key, value in known.items() if isinstance(value, str | int | float)}
-    tags |= dict(_PAIR.findall(row.get("other_tags", "")))
+    tags: dict[str, str] = dict(_PAIR.findall(row.get("other_tags", "")))
+    with contextlib.suppress(ValueError, RecursionError, AttributeError):  # it is no object of JSON
+        known = json.loads(row.get("tags", "")).items()
+        tags = {key: str(value) for key, value in known if isinstance(value, str | int | float)} | tags
     return tags | {key: value for key, value in row.items() if key not in PACKED}
 
 
@@ -212,7 +204,7 @@ class _Worth:
         self._facts = drawing.facts
         self._closes = zone.kind in ("forbidden", "keep_in")
         self._kind: Kind | None = zone.kind if zone.kind in ("road", "water") else None
-        name, assumed = zone.attribute, () if self._kind is None else COLUMNS[self._kind]
+        name, assumed = zone.attribute, [] if self._kind is None else COLUMNS[self._kind]
         has_classes = name is not None or not {*assumed, *PACKED}.isdisjoint(layer.columns)
         self._by_class = bool(zone.classes) or (self._kind is not None and has_classes)
         key = "factor" if zone.kind == "factor" else "pace_s_per_m"

@@ -5,15 +5,16 @@ from __future__ import annotations
 import contextlib
 import re
 from collections import Counter
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from shared_map.array_files import Bools, Floats
 from shared_map.importers.georeference import crs_name, place_on
-from shared_map.importers.raster_files import beginning, is_raster, opened
+from shared_map.importers.raster_files import DRAWINGS, beginning, is_raster, opened
 from swarm.config.ground import ZoneConfig
 from swarm.config.input_files import FileKind
 from swarm.errors import TerrainError
@@ -21,34 +22,22 @@ from swarm.grid import GridSpec, Window
 
 
 class Kind(NamedTuple):
-    """A format: GDAL's driver, and how its text is checked; None of a binary format."""
+    """A format: GDAL's driver, and how its text is checked, as `formats.toml` says; empty of a binary format."""
 
     driver: str
-    text: Literal["json", "xml", "fence"] | None = None
+    text: str
 
 
 # Atomic: what is skipped before the root is read in one way only, or a few hundred bytes would take for ever.
-_ROOT = rb"(?:(?><\?.*?\?>|<!--.*?-->|<!DOCTYPE[^>\[]*>)\s*)*+<(?:\w+:)?%s[\s/>]"
-_KINDS = {
-    rb"\0\0\x27\x0a": Kind("ESRI Shapefile"),
-    rb"fgb\x03fgb": Kind("FlatGeobuf"),
-    rb"SQLite format 3\0.{52}GP": Kind("GPKG"),
-    rb"[{\x1e]": Kind("GeoJSON", "json"),
-    rb"QGC WPL": Kind("GeoJSON", "fence"),
-    _ROOT % b"kml": Kind("LIBKML", "xml"),
-    _ROOT % b"gpx": Kind("GPX", "xml"),
-    _ROOT % b"osm": Kind("OSM", "xml"),
-}
-"""First bytes -> format. GDAL knows 80 formats, some of which name other files."""
+_BEFORE_ROOT = r"(?:(?><\?.*?\?>|<!--.*?-->|<!DOCTYPE[^>\[]*>)\s*)*+"
+IN_ARCHIVES: Sequence[str] = DRAWINGS["zipped"]
 
 
 def kind_of(head: bytes) -> Kind | None:
     """The format of a file by its first bytes; None if it is not read."""
-    head = head.removeprefix(b"\xef\xbb\xbf").lstrip()
-    return next((kind for begins, kind in _KINDS.items() if re.match(begins, head, re.DOTALL)), None)
-
-
-IN_ARCHIVES = (".shp", ".gpkg", ".geojson", ".json", ".kml", ".gpx", ".osm", ".fgb")
+    text = head.removeprefix(b"\xef\xbb\xbf").lstrip().decode("latin-1")
+    rows = ((begins.replace("BEFORE_ROOT", _BEFORE_ROOT), row) for begins, row in DRAWINGS["begins"].items())
+    return next((Kind(*row) for begins, row in rows if re.match(begins, text, re.DOTALL)), None)
 
 
 def is_vector(path: Path) -> bool:
@@ -127,7 +116,7 @@ def _friction(zone: ZoneConfig, path: Path, grid: GridSpec, where: str) -> Burnt
     """A raster of paces or factors. Infinite is lethal; where there is no value the ground is left as it is."""
     what = f"{where} {path}"
     if zone.kind not in ("pace", "factor"):
-        raise TerrainError(f"{what} is a raster, which goes with kind pace or factor, found {zone.kind!r}")
+        raise TerrainError(f"{what} is read as a raster, which goes with kind pace or factor, found {zone.kind!r}")
     given = [key for key in ("layer", "attribute", "width_m", "classes", "value") if getattr(zone, key)]
     if given:
         raise TerrainError(f"{what} is a raster, which has no {given[0]}")
@@ -144,9 +133,8 @@ def _friction(zone: ZoneConfig, path: Path, grid: GridSpec, where: str) -> Burnt
     known = values[~np.isnan(values)]
     wrong = known[(known < LEAST) | (known > MOST)]
     if wrong.size:
-        raise TerrainError(
-            f"{what} holds {wrong[0]:g}, expected a {zone.kind} of {LEAST:g} to {MOST:g}, or inf if nothing drives"
-        )
+        expected = f"a {zone.kind} of {LEAST:g} to {MOST:g}, or inf if nothing drives"
+        raise TerrainError(f"{what} holds {wrong[0]:g}, expected {expected}")
     count = int(known.size + lethal.sum())
     if not count:
         raise TerrainError(f"{what} has no value on the terrain")

@@ -115,6 +115,7 @@ def test_a_place_between_cells_and_an_unknown_setting_are_refused() -> None:
         finder.pull(None)  # type: ignore[arg-type]
     for key, value, words in (
         ("strateg", "full", "'strategy'"),
+        ("resolution", 10.0, "unknown key resolution; did you mean 'resolution_m'"),
         ("edge", "pap", "'paper'"),
         ("k_min", 99, "0 to 12"),
     ):

@@ -62,9 +62,8 @@ def collection(*more: Any) -> Damage:
 
 
 def reverse(f: dict[str, Any], chance: random.Random) -> None:
-    f["geometry"] = shapely.geometry.mapping(
-        shapely.transform(shapely.geometry.shape(f["geometry"]), lambda p: p[:, ::-1])
-    )
+    turned = shapely.transform(shapely.geometry.shape(f["geometry"]), lambda p: p[:, ::-1])
+    f["geometry"] = shapely.geometry.mapping(turned)
 
 
 KINDS = ["forbidden", "water", "factor", "keep_in"]
@@ -266,8 +265,8 @@ REASONS = {
     "arcgis": "is ArcGIS JSON; it is not read; `ogr2ogr",
     "geopackage": "is damaged",
     "system as text": r"Expected `object \| null`, got `str` - at `\$\.crs`",
-    "kml of two borders": "a Polygon holds 2 of outerBoundaryIs, expected one",
-    "kml of two shapes": "a Placemark holds 2 of Point, LineString",
+    "kml of two borders": "a Polygon has 2 of outerBoundaryIs, expected one",
+    "kml of two shapes": "a Placemark has 2 of Point, LineString",
     "system unknown": "its crs 'EPSG:99999' is no coordinate system; write EPSG:32632",
     "zip": r"is damaged or no \.zip",
 }
@@ -324,6 +323,9 @@ def test_a_part_of_another_shapefile_is_refused(tmp_path: Path) -> None:
             (tmp_path / f"mixed{part}").write_bytes(source.with_suffix(part).read_bytes())
         with pytest.raises(TerrainError, match=r"is damaged: its \.shx is that of another file"):
             closed_by(str(tmp_path / "mixed.shp"), "forbidden")
+    (tmp_path / "mixed.shx").unlink()
+    with pytest.raises(TerrainError, match=r"mixed\.shp lacks mixed\.shx, its index: copy it, too"):
+        closed_by(str(tmp_path / "mixed.shp"), "forbidden")
 
 
 # --- extents and fences -------------------------------------------------------------------------------------

@@ -64,10 +64,9 @@ def write_surfer(path: Path, side_m: float) -> None:
 
 def write_points(path: Path, side_m: float) -> None:
     xs, ys = WEST + (np.arange(COLS) + 0.5) * side_m, NORTH - (np.arange(ROWS) + 0.5) * side_m
+    y, x = np.meshgrid(ys, xs, indexing="ij")
     lines = [
-        f"{x!r} {y!r} {HEIGHTS[r, c]:.4f}"
-        for r, y in enumerate(map(float, ys))
-        for c, x in enumerate(map(float, xs))
+        "{!r} {!r} {:.4f}".format(*point) for point in np.stack([x, y, HEIGHTS], axis=-1).reshape(-1, 3).tolist()
     ]
     path.write_text("\n".join(lines) + "\n")
 
@@ -95,9 +94,8 @@ WRITERS: dict[str, Callable[[Path, float], None]] = {
 def test_any_importer_keeps_a_square_metric_grid(ending, side_m, tmp_path_factory):
     path = tmp_path_factory.mktemp("kept") / f"dem.{ending}"
     WRITERS[ending](path, side_m)
-    source = load(
-        path, crs=None if ending in ("tif", "img", "bil", "dat", "raw", "nc", "4.nc", "anything", "npz") else UTM
-    )
+    known = ("tif", "img", "bil", "dat", "raw", "nc", "4.nc", "anything", "npz")
+    source = load(path, crs=None if ending in known else UTM)
     assert source.grid.shape == HEIGHTS.shape
     assert source.grid.resolution_m == pytest.approx(side_m, rel=1e-6)
     np.testing.assert_allclose(source.elevation_m, HEIGHTS, rtol=0, atol=1e-4)

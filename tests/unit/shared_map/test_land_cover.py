@@ -127,6 +127,8 @@ def test_a_table_that_has_none_of_the_codes_is_no_table_of_this_map(tmp_path: Pa
         TerrainError, match=r"cover.tif: none of its codes on the terrain \(3, 7, 9\) is in the table"
     ):
         load(dem, cover=cover, cover_codes="worldcover")
+    with pytest.raises(TerrainError, match="nor a CSV file; did you mean 'worldcover'"):
+        load(dem, cover=cover, cover_codes="worldcovr")
     one = load(dem, cover=cover, cover_codes="worldcover", cover_classes={"9": "rock"})
     assert said(one.notes, "codes 3, 7 on")
 
@@ -170,9 +172,8 @@ def test_no_code_is_made_up_by_resampling(tmp_path: Path, system: str, step: flo
     cover = written(tmp_path / "cover.tif", codes, "uint8", crs=system, transform=place)
     grid = GridSpec(int(3000 / step), int(3000 / step), step, 500_200, 4_999_800, EUROPE)
     found = read_cover(cover, grid, TerrainConfig(cover_codes="worldcover"))
-    allowed = {
-        (int(ground.kind), float(np.float32(ground.factor))) for ground in TABLES["worldcover"].grounds.values()
-    }
+    grounds = TABLES["worldcover"].grounds.values()
+    allowed = {(int(ground.kind), float(np.float32(ground.factor))) for ground in grounds}
     pairs = set(zip(found.classes[found.known].tolist(), found.factor[found.known].tolist(), strict=True))
     assert len(pairs) == 4
     assert pairs <= allowed
@@ -232,7 +233,7 @@ def test_an_image_is_refused_as_land_cover_and_not_read_as_a_photo(tmp_path: Pat
 def test_a_map_of_codes_alone_is_level_ground_with_classes(tmp_path: Path) -> None:
     codes = patches(list(TABLES["worldcover"].grounds))
     path = written(tmp_path / "a.tif", codes, "uint8")
-    with pytest.raises(TerrainError, match=r"'worldcover' if it is land cover, .* = 'metres' if it has heights"):
+    with pytest.raises(TerrainError, match=r"'worldcover' if it is land cover, .* = 'metres' if heights"):
         load(path)
     assert load(path, elevation_encoding="metres").elevation_m.max() == 100
     for source in (load(path, cover_codes="worldcover"), load(_tagged(path, tmp_path / "b.tif"))):
@@ -263,6 +264,6 @@ def test_a_palette_of_unknown_codes_is_asked_for(tmp_path: Path) -> None:
     path = written(tmp_path / "a.tif", patches([1, 2, 3, 200]), "uint8")
     with rasterio.open(path, "r+") as file:
         file.write_colormap(1, {n: (n, 255 - n, 77, 255) for n in range(256)})
-    with pytest.raises(TerrainError, match=r"has a palette, and its codes \(1, 2, 3, 200\).*'metres' if it has"):
+    with pytest.raises(TerrainError, match=r"has a palette, and its codes \(1, 2, 3, 200\).*'metres' if heights"):
         load(path)
     assert load(path, elevation_encoding="metres").elevation_m.max() == 200

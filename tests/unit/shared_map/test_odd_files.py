@@ -42,17 +42,20 @@ def opaque() -> np.ndarray:
 def picture(path: Path, pixels: np.ndarray, **how: Any) -> Path:
     Image.fromarray(pixels).save(path, **how)
     for ending, text in ((f".{path.suffix[1]}{path.suffix[-1]}w", PLACE), (".prj", SYSTEM)):
-        path.with_suffix(ending).write_text(text)
+        path.with_suffix(ending.upper() if path.suffix.isupper() else ending).write_text(text)
     return path
 
 
-@pytest.mark.parametrize("ending", ["png", "jpg", "bmp"])
+@pytest.mark.parametrize("ending", ["png", "jpg", "bmp", "PNG"])
 def test_a_picture_lies_where_its_world_file_and_prj_say(tmp_path: Path, ending: str) -> None:
     dem = written(tmp_path / "dem.tif", GROUND)
     photo = load(dem, photo=str(picture(tmp_path / f"p.{ending}", COLOURS))).photo
     assert photo is not None
     assert np.abs(photo.astype(int) - COLOURS).mean() < (5 if ending == "jpg" else 0.1)
-    heights = load(picture(tmp_path / "h.png", (GROUND * 10).astype(np.uint16)), height_scale=0.1)
+    heights = load(
+        picture(tmp_path / ("h.PNG" if ending.isupper() else "h.png"), (GROUND * 10).astype(np.uint16)),
+        height_scale=0.1,
+    )
     assert heights.grid == load(dem).grid
     np.testing.assert_allclose(heights.elevation_m, GROUND, atol=0.1)
 
@@ -115,6 +118,9 @@ REFUSED: dict[str, tuple[Callable[[Path], Path], str]] = {
     "a header alone": (lambda p: said(p, "a.csv", "x,y,z\n"), "its points have 0 different x"),
     "PCRaster": (lambda p: said(p, "a.map", b"RUU CROSS SYSTEM MAP FORMAT" + bytes(300)), "is a map of PCRaster;"),
     "UTF-16": (lambda p: said(p, "a.xyz", "1 2 3\n".encode("utf-16")), "is text in UTF-16; .* save it as UTF-8"),
+    "grey levels with a place": (
+        lambda p: picture(p.with_suffix(".png"), GROUND.astype(np.uint8)), "how high a grey level is; set terrain",
+    ),
     "an image of a ROS map": (lambda p: said(p, "a.pgm", "P5\n2 2\n255\n1234"), r"name the \.yaml of the map"),
 }  # fmt: skip
 
@@ -169,7 +175,7 @@ def test_a_photo_that_cannot_be_meant_is_refused(tmp_path: Path) -> None:
     turned[0x112] = 6
     Image.fromarray(COLOURS).save(tmp_path / "turned.jpg", exif=turned)
     for path, words in (
-        (written(tmp_path / "void.tif", bands, "int16"), "holds -9999, which is no brightness: gdal_edit.py"),
+        (written(tmp_path / "void.tif", bands, "int16"), "holds -9999, no brightness: gdal_edit.py"),
         (tmp_path / "turned.jpg", "has EXIF orientation 6, expected 1"),
     ):
         with pytest.raises(TerrainError, match=words):
@@ -214,6 +220,7 @@ def test_an_island_in_a_hole_is_closed_and_a_hole_in_a_hole_is_asked_about(tmp_p
     ("text", "words"),
     [
         (osm([0, 1, 3, 2], '<tag k="natural" v="water"/>'), "way 7 is an area, but its ring is not closed"),
+        (osm([0, 1], "").replace("<way", '<way action="delete"'), "way 7 is deleted, but still in the file"),
         ("#saved by Mission Planner\n46.9\t9\n", r"fence of Mission Planner .* save it as \.waypoints"),
         ("none\n1\n   9.0  46.9\n   9.1 46.9\nEND\nEND\n", "an area of Osmosis"),
         ("\0\0\0\r\n\tOSMHeader", "osmium cat"),

@@ -98,7 +98,9 @@ def test_a_raster_gives_paces_or_factors_and_leaves_the_rest(tmp_path: Path) -> 
     far = raster(tmp_path / "d.tif", values, from_origin(0, 0, 10.0, 10.0), UTM.crs)
     with pytest.raises(TerrainError, match=r"not overlap the terrain: it covers x 0\.\.250, y -200\.\.0, the"):
         painted([ZoneConfig(kind="factor", file=far)])
-    with pytest.raises(TerrainError, match="is a raster, which goes with kind pace or factor, found 'road'"):
+    with pytest.raises(
+        TerrainError, match="is read as a raster, which goes with kind pace or factor, found 'road'"
+    ):
         painted([ZoneConfig(kind="road", file=file)])
     nowhere = raster(tmp_path / "e.tif", values, from_origin(500_100, 5_199_900, 10.0, 10.0), None)
     with pytest.raises(TerrainError, match="does not say in which coordinate system it is; set crs, for example"):

@@ -113,14 +113,8 @@ def test_the_merge_rule_cell_by_cell() -> None:
     def zone(kind: str, col0: int, col1: int) -> ZoneConfig:
         return ZoneConfig(kind=kind, polygon_m=((10 * col0, 0), (10 * col1, 0), (10 * col1, 10), (10 * col0, 10)))
 
-    zones = (
-        zone("forbidden", 1, 2),
-        zone("rough", 0, 2),
-        zone("preferred", 7, 8),
-        zone("road", 3, 8),
-        zone("rough", 3, 4),
-    )
-    paint_zones(pace, zones, grid, cost, void=np.isnan(grades))
+    drawn = (("forbidden", 1, 2), ("rough", 0, 2), ("preferred", 7, 8), ("road", 3, 8), ("rough", 3, 4))
+    paint_zones(pace, [zone(*each) for each in drawn], grid, cost, void=np.isnan(grades))
     # rough doubles; forbidden heartbeats later paint; a road bridges water and cliffs, never a void
     np.testing.assert_allclose(pace, [[0.2, inf, 0.05, 0.1, 0.05, 0.05, inf, 0.05]])
 
@@ -156,10 +150,9 @@ def test_a_zone_outside_the_terrain_is_refused_with_a_sentence() -> None:
     far = ZoneConfig(kind="forbidden", name="swamp", polygon_m=((900, 900), (950, 900), (950, 950)))
     with pytest.raises(TerrainError, match=r"'swamp' covers no cell.* 300 m x 200 m"):
         zone_mask(far, GridSpec(20, 30, 10.0))
+    level = TerrainConfig(source="synthetic", rows=20, cols=30)
     with pytest.raises(TerrainError, match="covers no cell"):
-        build_terrain(
-            Scenario(terrain=TerrainConfig(source="synthetic", rows=20, cols=30), cost=CostConfig(zones=(far,)))
-        )
+        build_terrain(Scenario(terrain=level, cost=CostConfig(zones=(far,))))
 
 
 def test_a_zone_may_be_a_painted_mask(tmp_path: Path) -> None:

@@ -96,9 +96,8 @@ def test_a_doubted_cell_costs_what_the_dearest_of_its_readings_does() -> None:
 
 
 def test_readings_count_only_where_the_class_is_unknown() -> None:
-    classes = np.array(
-        [[TerrainClass.UNKNOWN, TerrainClass.UNKNOWN, TerrainClass.WATER, TerrainClass.ROAD]], np.uint8
-    )
+    unknown, water, road = TerrainClass.UNKNOWN, TerrainClass.WATER, TerrainClass.ROAD
+    classes = np.array([[unknown, unknown, water, road]], np.uint8)
     readings = np.full((1, 4), BIT[TerrainClass.GRASS] | BIT[TerrainClass.FOREST], np.uint8)
     readings[0, 1] = 0
     level = np.zeros((1, 4), np.float32)

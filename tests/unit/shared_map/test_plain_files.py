@@ -56,7 +56,7 @@ BAD: dict[str, list[tuple[str | bytes, str]]] = {
             "north '46:30N', expected a number",
         ),
         (b"\xfd\xfe\x00", "is no raster that is read: it begins with .*gdal_translate"),
-        ("", "is no raster that is read: it begins with b''"),
+        ("", "is empty; it is not read; fetch the file again"),
     ],
     "a.map": [
         (MAP.replace("GS.W", "GS."), "line 6: 3 cells; expected 3 rows of 4"),
@@ -79,10 +79,11 @@ def test_a_bad_npz_is_refused_with_a_sentence(tmp_path: Path) -> None:
     path = tmp_path / "a.npz"
     for arrays, words in (
         ({"height": np.ones((3, 3))}, r"no `elevation` \(read: .*resolution_m.*\); it has height"),
-        ({"elevation": np.ones(3)}, r"elevation is \(3,\) float64; expected numbers in 2 dimensions"),
+        ({"elevation": np.ones(3)}, r"elevation is \(3,\) float64; expected rows of numbers"),
         ({"elevation": np.ones((3, 3))}, "does not say how large a cell is; set terrain.resolution_m"),
         ({"elevation": np.ones((3, 3)), "resolution_m": -1.0}, "must be positive"),
-        ({"elevation": np.array([["a", "b"]])}, "expected numbers"),
+        ({"elevation": np.array([["a", "b"]])}, "expected rows of numbers"),
+        ({"elevation": np.ones((3, 3)), "resolution_m": [1, 2]}, "its cell size is no single number"),
         ({"elevation": np.ones((3, 3)), "resolution_m": "a"}, "its cell size is no single number"),
     ):
         np.savez(path, **arrays)
@@ -124,10 +125,8 @@ def test_a_png_needs_a_scale(tmp_path: Path) -> None:
 
 def test_a_movingai_map_is_open_or_lethal_cell_by_cell(tmp_path: Path) -> None:
     (tmp_path / "a.map").write_text(MAP)
-    scenario = Scenario(
-        terrain=TerrainConfig(source=str(tmp_path / "a.map")), cost=CostConfig(flat_speed_m_per_s=4.0)
-    )
-    terrain = build_terrain(scenario)
+    source, cost = TerrainConfig(source=str(tmp_path / "a.map")), CostConfig(flat_speed_m_per_s=4.0)
+    terrain = build_terrain(Scenario(terrain=source, cost=cost))
     lethal = np.array([[0, 0, 1, 1], [0, 0, 0, 1], [1, 0, 0, 0]], bool)
     np.testing.assert_array_equal(np.isinf(terrain.pace_s_per_m), lethal)
     assert (terrain.pace_s_per_m[~lethal] == 0.25).all()
@@ -177,6 +176,7 @@ def test_ros_modes_scale_raw_and_negate(tmp_path: Path) -> None:
         (YAML.replace("-1.0", ".nan"), b"P5 1 1 255\n\0", "origin.0.: found nan"),
         (YAML.replace("0.0]", "0.7]"), b"P5 1 1 255\n\0", "turned by 0.7 rad"),
         (YAML + "mode: fancy\n", b"P5 1 1 255\n\0", "mode: found 'fancy'; allowed"),
+        ("- a\n", b"P5 1 1 255\n\0", "map: missing required field `image`"),
         (YAML + "what is this\n", b"P5 1 1 255\n\0", "line 7"),
         (YAML.replace("0.25", "0.9"), b"P5 1 1 255\n\0", "free <= occupied"),
     ],

@@ -53,12 +53,8 @@ def test_degrees_are_put_on_square_metres(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("crs", ["EPSG:3857", "EPSG:2263"])
 def test_systems_whose_unit_is_no_true_metre_are_reprojected(tmp_path: Path, crs: str) -> None:
-    where = (
-        from_origin(980_000, 200_000, 100, 100)
-        if crs == "EPSG:2263"
-        else from_origin(1_000_000, 5_900_000, 100, 100)
-    )
-    source = load(write(tmp_path / "a.tif", heights(), where, crs))
+    corner = (980_000, 200_000) if crs == "EPSG:2263" else (1_000_000, 5_900_000)
+    source = load(write(tmp_path / "a.tif", heights(), from_origin(*corner, 100, 100), crs))
     true_m = 30.48 if crs == "EPSG:2263" else 100 * np.cos(np.radians(46.7))
     assert source.grid.resolution_m == pytest.approx(true_m, rel=0.01)
 
@@ -223,6 +219,16 @@ def two_variables(folder: Path) -> dict[str, Any]:
         for name in ("height", "snow"):
             file.createVariable(name, "f4", ("y", "x"))[:] = 1.0
     return {"source": folder / "a.nc"}
+
+
+def test_degrees_of_a_netcdf_that_names_no_system_are_those_of_wgs_84(tmp_path: Path) -> None:
+    with netcdf_file(tmp_path / "a.nc", "w") as file:
+        for axis, count, first, unit in (("lat", 40, 46.0, b"degrees_north"), ("lon", 50, 9.0, b"degrees_east")):
+            file.createDimension(axis, count)
+            places = file.createVariable(axis, "f8", (axis,))
+            places.units, places[:] = unit, first + np.arange(count) / 1000
+        file.createVariable("z", "f4", ("lat", "lon"))[:] = heights()
+    assert said(load(tmp_path / "a.nc").notes, " m in EPSG:4326")
 
 
 NOISE = np.random.default_rng(1).normal(size=(400, 400)).astype(np.float32)

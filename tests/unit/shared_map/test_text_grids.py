@@ -38,6 +38,7 @@ def wrote(path: Path, text: str) -> Path:
         ("a.csv", text_of(POINTS, ",", "x,y,z")),
         ("a.csv", text_of(POINTS, ", ", '"Easting", "Northing", "Elevation"', "\r\n")),
         ("a.csv", "\ufeff" + text_of(POINTS, ";", "X;Y;Höhe;Z".replace("Höhe;", ""))),
+        ("a.csv", text_of(POINTS, ";").replace(".", ",")),
         ("a.xyz", "# made by hand\n" + text_of(POINTS, "\t")),
         ("a.xyz", text_of([(*point, 7, 8, 9) for point in POINTS])),
         ("a.csv", text_of([(z, n, x, y) for n, (x, y, z) in enumerate(POINTS)], ",", "z,id,x,y")),

@@ -61,9 +61,8 @@ def test_lines_are_as_wide_as_they_are_and_never_broken(tmp_path_factory, corner
     line = shapely.LineString(corners)
     if not line.intersects(shapely.box(0, 0, UTM.cols, UTM.rows)):
         return
-    file = geojson(
-        tmp_path_factory.mktemp("zone") / "a.geojson", [feature(line, highway="road", width=f"{width_m} m")]
-    )
+    path = tmp_path_factory.mktemp("zone") / "a.geojson"
+    file = geojson(path, [feature(line, highway="road", width=f"{width_m} m")])
     pace, _ = painted([ZoneConfig(kind="road", file=file)])
     road = pace < 0.09
     away_m = np.full(road.shape, np.inf)
@@ -190,12 +189,7 @@ def test_classes_of_roads_and_water_are_those_of_openstreetmap_or_ones_own(tmp_p
 
 
 def test_factors_and_paces_come_from_a_column_a_value_or_a_class(tmp_path: Path) -> None:
-    boxes = [
-        shapely.box(2, 2, 10, 10),
-        shapely.box(6, 6, 14, 14),
-        shapely.box(20, 2, 28, 10),
-        shapely.box(30, 2, 38, 10),
-    ]
+    boxes = [shapely.box(x, y, x + 8, y + 8) for x, y in ((2, 2), (6, 6), (20, 2), (30, 2))]
     columns = {"f": [2.0, 3.0, np.nan, -1.0], "kind": ["mud", "sand", "mud", "ice"]}
     file = written(tmp_path / "a.gpkg", boxes, UTM.crs, columns)
     pace, (facts,) = painted([ZoneConfig(kind="factor", file=file, attribute="f")])

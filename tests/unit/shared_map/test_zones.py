@@ -150,9 +150,8 @@ def test_a_zone_without_a_name_gets_one_that_was_never_used(world: ZoneWorld) ->
 
 def test_metres_are_those_of_poses(world: ZoneWorld) -> None:
     grid = world.terrain.grid
-    corners = [
-        (grid.west_m + col * grid.resolution_m, grid.north_m - row * grid.resolution_m) for row, col in SQUARE
-    ]
+    side_m = grid.resolution_m
+    corners = [(grid.west_m + col * side_m, grid.north_m - row * side_m) for row, col in SQUARE]
     assert isinstance(world.order(action="add", name="z", polygon_m=corners), Zones)
     assert world.lethal() == SQUARE_CELLS
     assert isinstance(world.order(action="remove", name="z"), Zones)
@@ -287,9 +286,8 @@ def test_a_zone_of_a_pace_does_not_open_what_the_terrain_closes() -> None:
     pace[3, 3:6] = np.inf
     terrain, store = terrain_of_pace(pace), KeeperStore(":memory:")
     replica = MapReplica(terrain.grid, CostMap(terrain))
-    order = ZoneOrder(
-        action="add", name="z", kind="pace", pace_s_per_m=0.5, polygon=[(2, 2), (2, 8), (5, 8), (5, 2)]
-    )
+    ring = [(2, 2), (2, 8), (5, 8), (5, 2)]
+    order = ZoneOrder(action="add", name="z", kind="pace", pace_s_per_m=0.5, polygon=ring)
     sets = zone_sets(order, replica, terrain, store.set_aside, 1, {})
     assert not isinstance(sets, str)
     assert sum(len(each.kinds) for each in sets) == 3 * 6 - 3
