@@ -20,8 +20,8 @@ MOST_BUCKETS = 1 << 12
 """A growth can stop if its narrow buckets are at most this number: passing that many empty buckets costs less than
 growing a whole map. With more, each growth is whole."""
 _AIMED = 4.0
-"""A way that costs as much as this many times the straight one at the lowest cost costs too much to aim: to find the
-cells that may be left out takes longer than to grow them."""
+"""No growth aims at a way of more than this many times the straight one at the lowest cost: to find which cells
+may be left out takes longer than to grow them there."""
 
 
 class CutTree(NamedTuple):
@@ -139,8 +139,8 @@ class PartialGrowth:
         self._find_bound()
 
     def aim_at(self, askers: Cells, root: int) -> queue_dial.Aim:
-        """Returns the aim of the next growth, from a padded, passable root to such cells: none costs more than the way
-        over the tree in hand and its root. `NO_AIM` if that is not known, or would leave out too few cells."""
+        """Returns the aim of the next growth, from a padded, passable root to such cells: none costs more than over
+        the tree in hand and its root. `NO_AIM` if that is not known, or would leave out too few cells."""
         grid, lowest = self._grid, self._grid.lowest_cell_cost
         if self.root < 0 or self.bound < 0 or not askers.size:
             return queue_dial.NO_AIM
