@@ -7,7 +7,7 @@ bound of the cost of any route. The planner ensures this in six steps:
 2. *Intake.* Changes that no follower's route passes wait for a second at most (`followers.MapIntake`).
 3. *Repair.* Costs that have risen detach what hung on them, costs that have fallen spread (`kernels.repair`).
 4. *Move.* The tree is led to the target's new cell: a window around it is grown, then, under an exact strategy, all
-   costs are made exact by the parents (`kernels.costs_from_parents`, or `kernels.partition*` on large maps). If
+   costs are made exact by the parents (`kernels.costs_from_parents`, or `kernels.tile_pieces` on large maps). If
    that takes too long for the thread that answers, a worker searches the whole tree. `target_tree.Decision` is the
    decision, by the row of the strategy (`strategy`) and by the times of searches (`growth_times`).
 5. *Certificate.* An exact tree bounds itself. Otherwise the last exact costs are a consistent heuristic, lowered

@@ -75,18 +75,9 @@ class Puller:
         scratch = (np.empty(longest, np.int64), np.empty((2, longest)), *np.empty((2, longest), np.int64))
         out = np.empty(2 * steps, np.uint8), np.empty(many, np.int64)
         legs, turned = np.empty(2 * steps, np.uint32), np.empty(1, np.int64)
-        prices = np.empty((3, many))
+        ground, prices = (self._pace, self._flight, self._offsets, self._corners), np.empty((3, many))
         while True:
-            self._kernel(
-                self._pace,
-                self._flight,
-                self._offsets,
-                self._corners,
-                (*given, stays),
-                scratch,
-                (*out, legs, turned),
-                prices,
-            )
+            self._kernel(*ground, (*given, stays), scratch, (*out, legs, turned), prices)
             done = int(out[1][-1]) if many else 0
             returns = self._returns(starts, out[0][:done], out[1]) & ~stays
             if not returns.any():

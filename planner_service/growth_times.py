@@ -8,7 +8,7 @@ from collections import deque
 
 import numpy as np
 
-from planner_service.strategy import AHEAD, STRATEGIES, Growths, OnMove, Strategy, StrategyRow
+from planner_service.strategy import AHEAD, HYSTERESIS, STRATEGIES, Growths, OnMove, Strategy, StrategyRow
 from planner_service.tree.cost_changes import Cells
 from planner_service.tree.strides import FINE, LEAST
 from swarm.config.scenario import PlannerConfig
@@ -21,6 +21,11 @@ MODEL_EXACT_NS_PER_CELL = 6
 MODEL_PIECES_NS_PER_ROW = 2_400
 """The same of a tree in pieces, for each row of a square map: `bench moves` measures 1.2 ms at 512 x 512, 4 at
 2048, 10 at 4096. It counts until a move has been measured."""
+MODEL_NEAR_NS_PER_CELL = 7
+"""The same of a growth that stops at its askers, for each cell of the window around the target that holds them: the
+least that `bench scale --within` and `bench pursuit` measure, so that such a growth is tried before it is left."""
+NEAR_CELLS = 1 << 12
+"""Such a growth takes as long for these cells more: to clear the last one, and to find out how far it has to go."""
 PIECES_CELLS = 1 << 18
 """Maps of this number of cells have their exact trees in pieces. At 512 x 512 an exact move of one takes as long as
 by the parents on made-up terrain, less on elevation models; at 383 x 361 more; from there on ever less."""
@@ -79,6 +84,9 @@ class GrowthTimes:
         """True if a row may come into force by which growths stop: askers are then noted under the others, too."""
         self._full_took_ns: deque[int] = deque(maxlen=_MEDIAN_OF)
         self._exact_took_ns: deque[int] = deque(maxlen=_MEDIAN_OF)
+        # What growths up to askers would take if the window were the map. The first ones make their scratch, too.
+        self._near_whole_ns = grid.cells * MODEL_NEAR_NS_PER_CELL
+        self._near_took_ns = deque([self._near_whole_ns] * 2, maxlen=_MEDIAN_OF)
         self._moves_per_tick, self._chosen_at = 1.0, 1.0
         """Moves in the last `_TICKS` ticks or so; the value when the row was chosen."""
         self._ticks = 0
@@ -102,7 +110,8 @@ class GrowthTimes:
             self._choose()
 
     def note_near(self, cells: float) -> None:
-        """Notes the cells of a growth up to the askers; inf if growths cannot stop."""
+        """Notes the cells of the window that holds the target and its askers, 0 without any; inf if growths cannot
+        stop."""
         if cells != self._near_cells:
             self._near_cells = cells
             self._choose()
@@ -110,10 +119,28 @@ class GrowthTimes:
     @property
     def near_ns(self) -> float:
         """Returns the CPU time of a growth up to the askers; inf if growths cannot stop."""
-        return self._near_cells * self.full_ns / self._grid.cells
+        return (self._near_cells + NEAR_CELLS) * self._near_whole_ns / self._grid.cells
+
+    def stops(self, is_whole: bool) -> bool:
+        """Returns True if a growth up to the askers is to follow a move of the target, and not an exact move.
+
+        is_whole  there is a whole tree, which is given up for a clear gain only: to have it again takes a growth
+        """
+        return self.near_ns < self.exact_ns * (HYSTERESIS if is_whole else 1.0)
+
+    def observe(self, kind: str, took_ns: int) -> None:
+        """CPU time (ns) of a growth or an exact move, by the kind of update. A simulation does not call it."""
+        observers = {"exact": self.observe_exact_ns, "bounded": self._observe_near_ns}
+        observers.get(kind, self.observe_full_ns)(took_ns)
+
+    def _observe_near_ns(self, took_ns: int) -> None:
+        if self._near_cells:  # one without askers tells nothing of others
+            whole_ns = int(took_ns * self._grid.cells / (self._near_cells + NEAR_CELLS))
+            self._near_whole_ns = max(1, _median_with(self._near_took_ns, whole_ns))
+            self._choose()
 
     def observe_full_ns(self, took_ns: int) -> None:
-        """Notes the time of a full search, unless it found networks, too. A simulation does not call it."""
+        """Notes the time of a full search, unless it found networks, too."""
         median_ns = _median_with(self._full_took_ns, took_ns)
         # Growths foretell no move of a tree in pieces: they include the cutting, and all planners of a machine grow
         # their first trees at once. The tree is there, so a move is tried. To leave it untried takes another
@@ -127,8 +154,7 @@ class GrowthTimes:
 
     def observe_exact_ns(self, took_ns: int) -> None:
         """CPU time (ns) of an exact update, without the preceding repair."""
-        if self.in_pieces and not self._exact_took_ns:
-            # One slow move, such as the first after a growth, gives up no tree: another one takes a second.
+        if not self._exact_took_ns:  # one slow move, such as the first after a growth, gives up no tree
             self._exact_took_ns.extend([int(self.exact_ns)] * 2)
         self.exact_ns = max(1, _median_with(self._exact_took_ns, took_ns))
         self._choose()
@@ -195,7 +221,7 @@ class Askers:
         self._needed = deque([0], maxlen=_TICKS)
 
     def note(self, cells: Cells, needed: int) -> None:
-        """Notes cells that asked, and about how many a growth as far as they are has to visit."""
+        """Notes cells that asked, and how many the window holds that reaches as far as they are."""
         self._fresh.append(cells)
         self._needed[-1] = max(self._needed[-1], needed)
 
@@ -208,7 +234,7 @@ class Askers:
 
     @property
     def needed(self) -> int:
-        """Returns about how many cells a growth to the farthest recent asker visits."""
+        """Returns how many cells the window holds that reaches as far as the farthest recent asker."""
         return max(self._needed)
 
 

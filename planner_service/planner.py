@@ -353,8 +353,8 @@ class Planner:
         self.counters.count("growths")
         self._growth_ms = took_ns / 1e6
         self.counters.observe("growth_ms", self._growth_ms)
-        if self._stopwatch is not None and kind != "bounded":
-            (self.tree.times.observe_exact_ns if kind == "exact" else self.tree.times.observe_full_ns)(took_ns)
+        if self._stopwatch is not None:
+            self.tree.times.observe(kind, took_ns)
 
     def _now(self) -> int:
         return 0 if self._stopwatch is None else self._stopwatch()

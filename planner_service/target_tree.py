@@ -20,21 +20,12 @@ from planner_service.growth_times import Askers, GrowthTimes, WindowSchedule, ex
 from planner_service.kernels.layout import NONE
 from planner_service.kernels.route_kernels import UNREACHABLE
 from planner_service.kernels.stride_networks import StrideNetwork
-from planner_service.strategy import HYSTERESIS, OnMove, Strategy, StrategyRow, whole_trees_only
+from planner_service.strategy import OnMove, Strategy, StrategyRow, whole_trees_only
+from planner_service.tree import partitioned_tree
 from planner_service.tree.cost_changes import Changes
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
 from planner_service.tree.partial_growth import PartialGrowth
-from planner_service.tree.partitioned_tree import (
-    AnyTree,
-    GrownTree,
-    PartitionedTree,
-    can_be_root,
-    growth_job,
-    in_cells,
-    in_pieces,
-    offered_gaps,
-)
 from planner_service.tree.route_bounds import LowerBounds, read_routes
 from planner_service.tree.strides import find_strides
 from shared_map.array_files import Floats
@@ -76,9 +67,6 @@ class Update:
         return Update("window", window, cells, self.wants_full, repaired.repair_ns)
 
 
-_CELLS_PER_SQUARE = 8
-"""A growth as far as an asker d rows or columns away takes as long as this times d * d cells of a whole growth:
-`bench scale --within` shows from where on an exact move takes less."""
 _NEAR_CELLS = 256
 """Rows and columns about a target within which the nearest open cell is looked for: some milliseconds."""
 
@@ -163,7 +151,7 @@ class TargetTree:
         # The last known cell costs of the map, and whether there are any.
         self._costs = CostGrid(grid, config, climb)
         self._loaded = False
-        self._tree: AnyTree = CostToGoTree(self._costs)
+        self._tree: partitioned_tree.AnyTree = CostToGoTree(self._costs)
         self._state = State.STALE
         # A worker has a `full_job` that was not adopted yet: no second one is asked for.
         self._job_out = False
@@ -221,13 +209,15 @@ class TargetTree:
         self.times.note_near(self._askers.needed if self._growth.usable else np.inf)
         return self._follow(target_cell, changes) if self._set_target(target_cell, changes) else Update("none")
 
-    def full_job(self, target_cell: int) -> Callable[[], GrownTree]:
+    def full_job(self, target_cell: int) -> Callable[[], partitioned_tree.GrownTree]:
         """Returns a full search for a worker, on the last known map: see `growth_job`."""
         self._too_far = False
         leads_there = self.ready and self._state is not State.STALE and self._tree.root == target_cell
         offered = self._tree.parent.copy() if leads_there else None
         self._job_out = True
-        return growth_job(self._costs.snapshot(), target_cell, self.map_version, offered, self._in_pieces)
+        return partitioned_tree.growth_job(
+            self._costs.snapshot(), target_cell, self.map_version, offered, self._in_pieces
+        )
 
     @property
     def wants_full(self) -> bool:
@@ -251,7 +241,7 @@ class TargetTree:
 
     def adopt(
         self,
-        grown: GrownTree,
+        grown: partitioned_tree.GrownTree,
         pace: Floats,
         target_cell: int,
         dirty: Sequence[Window],
@@ -268,7 +258,7 @@ class TargetTree:
         changes = self._learn(pace, dirty)
         self.map_version = map_version
         if grown.offered is not None:
-            self.last_gaps = offered_gaps(self._costs, grown, self._inside(followed_cells))
+            self.last_gaps = partitioned_tree.offered_gaps(self._costs, grown, self._inside(followed_cells))
         if not self._set_target(target_cell, changes):
             return Update("none")
         since = self._costs.changes_since(grown.cell_cost)
@@ -290,14 +280,12 @@ class TargetTree:
     def force(self, cells: Any) -> Update:
         """Forces the range to cover these cells, so that their routes become optimal (section 3.3.2).
 
-        If a full search would delay answers for long, a worker does it, and routes are optimal once its tree is
-        adopted; until then they are the best in a window around the cells and the target, if that is quick.
+        If that would delay answers for long, a worker grows the whole tree, and routes are optimal once that is
+        adopted.
         """
         target = self.target_cell
-        if not self.ready or target is None:
-            return Update("none")
         wanted = self._inside(cells)
-        if wanted.size == 0 or self._tree.exact:
+        if target is None or not wanted.size or self._tree.exact:
             return Update("none")
         if (forced := self._force_near(wanted)) is not None:
             return forced
@@ -305,15 +293,7 @@ class TargetTree:
             return self._grow_full(target)
         if self._can_mend and self.times.is_short(self.times.exact_ns):
             return self._mend()
-        half = max(self._grid.distance_cells(target, cell) for cell in wanted.tolist()) * 5 // 4 + 1
-        window = self._grid.around(target, half)
-        grown_cells = 0
-        has_windows = self.strategy.on_move is not OnMove.WHOLE_TREE
-        if half <= self.times.widest(thins_far_cells=False) and has_windows and self._tree.precise:
-            grown_cells = self._tree.move(target, window)
-        if not grown_cells:
-            return Update("none", wants_full=not self._job_out)
-        return Update("forced", window, grown_cells, wants_full=not self._job_out)
+        return Update("none", wants_full=not self._job_out)
 
     # --- answers ------------------------------------------------------------------------------------------------
 
@@ -370,7 +350,7 @@ class TargetTree:
     def _set_target(self, target_cell: int, changes: Changes | None) -> bool:
         """Returns True if the target is on a cell to which a tree can lead. If not, the tree is stale as soon as
         the map changes."""
-        self.target_cell = target_cell if can_be_root(self._costs, target_cell) else None
+        self.target_cell = target_cell if partitioned_tree.can_be_root(self._costs, target_cell) else None
         changed = changes is None or bool(changes.cells.size)
         if self.ready or not 0 <= target_cell < self._grid.cells:
             self.lethal_target = None
@@ -432,20 +412,20 @@ class TargetTree:
             return Decision("whole")
         if row.on_move is OnMove.EXACT_MOVE:
             # To cut a tree into pieces, or to write a cost into every cell of one, takes as long as to grow it.
-            cuts = self._in_pieces and not isinstance(tree, PartitionedTree) and not self._is_quick
+            cuts = self._in_pieces and not isinstance(tree, partitioned_tree.PartitionedTree) and not self._is_quick
             if not self._can_mend or cuts:
                 return Decision("whole")
             return Decision("exact", exact_half(self._grid, tree.root, target_cell) if moved else 0)
-        if isinstance(tree, PartitionedTree) and not self._is_quick:
+        if isinstance(tree, partitioned_tree.PartitionedTree) and not self._is_quick:
             return Decision("whole")
         return Decision("window", *self._windows.after_move(row, tree.root, target_cell, self._network is not None))
 
     def _perform(self, decision: Decision, target_cell: int) -> Update:
         """Performs a decision; if it does not lead to the target, it searches the whole tree."""
         if decision.how == "exact" and self._in_pieces:
-            self._tree = in_pieces(self._tree)
+            self._tree = partitioned_tree.in_pieces(self._tree)
         elif decision.how == "window":
-            self._tree = self._prepared(in_cells(self._tree))
+            self._tree = self._prepared(partitioned_tree.in_cells(self._tree))
         if decision.how == "nothing":
             return Update("none")
         if decision.how == "whole" or not self._tree.fine:
@@ -495,14 +475,13 @@ class TargetTree:
             near = self._grow_near(target_cell, rest=not self._stops)
             if near is not None:
                 return near
-        return self._grow_whole(target_cell)
-
-    def _grow_whole(self, target_cell: int) -> Update:
         if not self._is_quick:
             self._state, self.target_cell = State.STALE, None
             return Update("none", wants_full=not self._job_out)
-        if isinstance(self._tree, PartitionedTree) is not self._in_pieces:
-            self._tree = PartitionedTree(self._costs) if self._in_pieces else CostToGoTree(self._costs)
+        if isinstance(self._tree, partitioned_tree.PartitionedTree) is not self._in_pieces:
+            self._tree = (
+                partitioned_tree.PartitionedTree(self._costs) if self._in_pieces else CostToGoTree(self._costs)
+            )
         self._tree.grow(target_cell)
         self._state = State.CURRENT
         self._windows.note_whole(target_cell)
@@ -520,8 +499,7 @@ class TargetTree:
             return False
         if row.on_move is OnMove.WHOLE_TREE:
             return self._is_quick or self.times.is_short(self.times.near_ns)
-        # A whole tree is given up for a clear gain only: to have it again takes a growth.
-        return self.times.near_ns < self.times.exact_ns * (HYSTERESIS if self._is_whole else 1.0)
+        return self.times.stops(self._is_whole)
 
     @property
     def _is_whole(self) -> bool:
@@ -544,8 +522,10 @@ class TargetTree:
 
         rest  the worker is to grow the whole tree
         """
-        self._growth.begin(self._costs.pad(target_cell))
-        grown = self._growth.go_on(self._passable(self._askers.cells), self.times.most_cells)
+        root, askers = self._costs.pad(target_cell), self._passable(self._askers.cells)
+        aim = self._growth.aim_at(askers, root)
+        self._growth.begin(root)
+        grown = self._growth.go_on(askers, self.times.most_cells, aim)
         if grown < 0:
             return None
         self._take_grown(target_cell)
@@ -572,12 +552,12 @@ class TargetTree:
         if not self.times.may_stop and self._is_whole:
             return
         starts = self._open(asked)
-        if not self._is_whole and (missing := self._without_path(starts)).size:
-            if self._growth.go_on(missing, self.times.most_cells) < 0:
+        if not self._is_whole and self._without_path(starts).size:
+            if self._growth.go_on(starts, self.times.most_cells) < 0:
                 self._too_far = True
                 return
             self._take_grown(self._tree.root)
-            self._too_far |= not self._is_whole and self._without_path(missing).size > 0
+            self._too_far |= not self._is_whole and self._without_path(starts).size > 0
         if not self._is_whole and isinstance(self._tree, CostToGoTree):
             self._tree.point(starts)
         self._note(starts)
@@ -592,14 +572,12 @@ class TargetTree:
         """Notes padded cells that asked, and how far a growth must go for them."""
         if not starts.size:
             return
-        if (self._is_whole or self._too_far) and self._without_path(starts).size:
-            self._askers.note(starts, self._grid.cells)
-            return
         rows, cols = np.divmod(starts, self._costs.stride)
         row, col = divmod(self._costs.pad(self._tree.root), self._costs.stride)
-        self._askers.note(
-            starts, _CELLS_PER_SQUARE * int(max(np.abs(rows - row).max(), np.abs(cols - col).max())) ** 2
-        )
+        half = int(max(np.abs(rows - row).max(), np.abs(cols - col).max()))
+        if (self._is_whole or self._too_far) and self._without_path(starts).size:
+            half = self._grid.cells
+        self._askers.note(starts, self._grid.around(self._tree.root, half).cells)
 
     def _leads(self, starts: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Returns from which of some padded, passable cells the tree leads to its root."""
@@ -662,7 +640,7 @@ class TargetTree:
     def _can_mend(self) -> bool:
         """Returns True if the tree can be made exact here and now, by its parents. Where exact trees are in pieces,
         to make another exact takes as long as to grow it."""
-        fits = isinstance(self._tree, PartitionedTree) or not self.times.in_pieces
+        fits = isinstance(self._tree, partitioned_tree.PartitionedTree) or not self.times.in_pieces
         return fits and self.times.mends_quickly and self._all_kernels() and self._tree.fine
 
     def _mend(self) -> Update:

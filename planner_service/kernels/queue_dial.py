@@ -12,8 +12,13 @@ Arrays, beside those of `layout`:
     touched  uint32  (size + 1,)     padded cells that have a cost, in the order of the buckets they got it from
     batch    uint32  (size + AHEAD,) padded cells of the bucket that is being served
     queue    as of `heap_and_buckets`; `make_scratch` says how large
+    aim      a tuple of float32      padded rows and columns (row0, col0, row1, col1) of a box with all askers, row1
+                                     and col1 in it; the lowest cell cost, s; and the most that a cheapest way of
+                                     an asker costs, s. A growth leaves out the cells over which every way costs
+                                     more, even at the lowest cost. With `NO_AIM` it leaves out none
     state    int64   (4,)            the last bucket served; entries that wait in the queue; how many of `touched`
-                                     were put into it; how many there are. `begin` writes it, growths change it
+                                     were put into it; how many there are. (0, 0, 0, 1) where a growth begins,
+                                     with a cost of 0 for the root, the first of `touched`
 
 The form of the loops was measured, and small changes cost much. Cells are touched without branches, sorted into
 buckets in two passes (which bucket, then where in it: in one, each store had the next cell's loads wait), and taken
@@ -29,23 +34,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from planner_service.kernels import layout
 from planner_service.kernels.decorators import helper, kernel, prefetch
 from planner_service.kernels.heap_and_buckets import QUEUE, Queue, empty, make_queue, put, take
-from planner_service.kernels.layout import (
-    BOX,
-    BUCKETS,
-    GRID,
-    INF,
-    RULE_OCTILE,
-    RULE_PAPER,
-    SQRT2,
-    TOO_FINE,
-    WALL,
-    Buckets,
-    Floats,
-    Longs,
-    PaddedGrid,
-)
 
 _ONE = np.uint64(1)
 _ZERO = np.uint64(0)
@@ -56,6 +47,10 @@ WHOLE = -1
 AHEAD = 8
 """Cells of a batch between asking for one's memory and using it: a fifth of the time at 2048 x 2048
 (docs/design/bucket-queues.md)."""
+Aim = tuple[float, float, float, float, float, float]
+NO_AIM: Aim = (0.0, 0.0, 0.0, 0.0, 0.0, np.inf)
+_DETOUR = np.float32(0.4142135)
+"""Least that a diagonal octile step costs beyond a straight one, in straight ones."""
 _SCRATCH = f"Tuple((u4[::1], u4[::1], {QUEUE}))"
 
 
@@ -63,7 +58,7 @@ _SCRATCH = f"Tuple((u4[::1], u4[::1], {QUEUE}))"
 def open_costs(cell_cost, cost):
     """Before a growth: inf on passable cells, WALL on the others."""
     for i in range(cell_cost.size):
-        cost[i] = INF if cell_cost[i] < INF else WALL
+        cost[i] = layout.INF if cell_cost[i] < layout.INF else layout.WALL
 
 
 @helper
@@ -71,7 +66,7 @@ def close_costs(cost):
     """After a growth: inf on lethal cells too."""
     for i in range(cost.size):
         c = cost[i]
-        cost[i] = c if c >= _ZERO32 else INF
+        cost[i] = c if c >= _ZERO32 else layout.INF
 
 
 Scratch = tuple[NDArray[np.uint32], NDArray[np.uint32], Queue]
@@ -80,7 +75,7 @@ Scratch = tuple[NDArray[np.uint32], NDArray[np.uint32], Queue]
 def make_scratch(size: int, rule: int, buckets: int) -> Scratch:
     """(touched, batch, queue) for a growth over `size` padded cells, for the worst case: the system keeps no page
     that was not written."""
-    kinds = 2 if rule == RULE_OCTILE else 1
+    kinds = 2 if rule == layout.RULE_OCTILE else 1
     # Each cell is touched once; an offer to a cell that has a cost writes one place behind.
     touched, batch = np.empty(size + 1, np.uint32), np.empty(size + AHEAD, np.uint32)
     return touched, batch, make_queue(kinds * size, kinds * buckets)
@@ -115,7 +110,7 @@ def offer_straight(cell_cost, cost, s, batch, n, touched):
         for i, old in ((u - s, north), (u - _ONE, west), (u + _ONE, east), (u + s, south)):
             cost[i] = min(old, key)
             touched[count] = i
-            count += np.uint64(old == INF)
+            count += np.uint64(old == layout.INF)
     return count
 
 
@@ -125,7 +120,7 @@ def offer_diagonal(cell_cost, cost, s, corners, batch, n, touched, count):
     for p in range(n):
         _ask_for(cell_cost, cost, s, np.uint64(batch[p + np.uint64(AHEAD)]))
         u = np.uint64(batch[p])
-        key = cost[u] + cell_cost[u] * SQRT2
+        key = cost[u] + cell_cost[u] * layout.SQRT2
         above = u - s
         below = u + s
         north, west, east, south = cost[above], cost[u - _ONE], cost[u + _ONE], cost[below]
@@ -140,7 +135,7 @@ def offer_diagonal(cell_cost, cost, s, corners, batch, n, touched, count):
             offer = key if corners else max(key, -gate)
             cost[i] = min(old, offer)
             touched[count] = i
-            count += np.uint64(old - offer == INF)
+            count += np.uint64(old - offer == layout.INF)
     return count
 
 
@@ -166,12 +161,12 @@ def offer_around(cell_cost, cost, s, corners, batch, n, touched):
         for i, old in ((above, north), (u - _ONE, west), (u + _ONE, east), (below, south)):
             cost[i] = min(old, key)
             touched[count] = i
-            count += np.uint64(old == INF)
+            count += np.uint64(old == layout.INF)
         for i, old, gate in around:
             offer = key if corners else max(key, -gate)
             cost[i] = min(old, offer)
             touched[count] = i
-            count += np.uint64(old - offer == INF)
+            count += np.uint64(old - offer == layout.INF)
     return count
 
 
@@ -186,23 +181,40 @@ def _file(grid, cost, buckets, scratch, first, count, least):
     inverse = _ONE32 / np.float32(width)
     _choose(grid[0], cost, _ONE32, inverse, least, cells, count, batch)
     put(queue, cells, count, batch, mask, _ZERO)
-    if grid[3] != RULE_OCTILE:
+    if grid[3] != layout.RULE_OCTILE:
         return count
-    _choose(grid[0], cost, SQRT2, inverse, least, cells, count, batch)
+    _choose(grid[0], cost, layout.SQRT2, inverse, least, cells, count, batch)
     put(queue, cells, count, batch, mask, length)
     return count + count
 
 
-def begin(cost: Floats, root: int, scratch: Scratch, state: Longs) -> None:
-    """Begins a growth from a padded, passable root, on costs of inf and WALL."""
-    cost[root] = 0.0
-    scratch[0][0] = root
-    state[:] = 0, 0, 0, 1
+@helper
+def _leave_out(grid, cost, cells, count, aim):
+    """Takes the cells that `aim` leaves out from `cells`, and their costs. Returns how many are left. Divides as
+    `box_of`."""
+    stride, rule = grid[2], grid[3]
+    row0, col0, row1, col1, lowest, most = aim
+    share = 1.0 / stride
+    slanted = _DETOUR if rule == layout.RULE_OCTILE else _ZERO32
+    left = _ZERO
+    for i in range(count):
+        v = np.int32(cells[i])
+        line = np.int32((v + 0.5) * share)
+        row, col = np.float32(line), np.float32(np.int32(v - line * np.int32(stride)))
+        down = max(max(row0 - row, row - row1), _ZERO32)
+        across = max(max(col0 - col, col - col1), _ZERO32)
+        steps = max(down, across) + slanted * min(down, across)
+        u = np.uint64(cells[i])
+        near = cost[u] + steps * lowest <= most
+        cost[u] = cost[u] if near else layout.INF
+        cells[left] = cells[i]
+        left += np.uint64(near)
+    return left
 
 
-@kernel(f"({GRID}, f4[::1], {BUCKETS}, {_SCRATCH}, i8[::1], i8[::1], i8)")
-def grow_by_buckets(grid, cost, buckets, scratch, state, askers, most):
-    """Costs to a root. Goes on from `state`, which `begin` or `resume` left, or an earlier call.
+@kernel(f"({layout.GRID}, f4[::1], {layout.BUCKETS}, {_SCRATCH}, i8[::1], i8[::1], i8, UniTuple(f4, 6))")
+def grow_by_buckets(grid, cost, buckets, scratch, state, askers, most, aim):
+    """Costs to a root. Goes on from `state`, which `resume` or an earlier call left, or begins.
 
     buckets  width: below the lowest cell cost, s, so that nothing in a bucket leads back into it. count: of the
              circular queue, a power of two; count * width exceeds the costliest step by two widths
@@ -223,7 +235,7 @@ def grow_by_buckets(grid, cost, buckets, scratch, state, askers, most):
     s = np.uint64(stride)
     length = np.uint64(circle)
     mask = length - _ONE
-    second = length if rule == RULE_OCTILE else _ZERO
+    second = length if rule == layout.RULE_OCTILE else _ZERO
 
     if most == WHOLE:
         open_costs(cell_cost, cost)
@@ -231,7 +243,7 @@ def grow_by_buckets(grid, cost, buckets, scratch, state, askers, most):
         touched[0] = askers[0]
         state[0], state[1], state[2], state[3] = 0, 0, 0, 1
     if state[2] == 0:
-        empty(queue, 2 * circle if rule == RULE_OCTILE else circle)
+        empty(queue, 2 * circle if rule == layout.RULE_OCTILE else circle)
     current = np.int32(state[0])
     waiting, filed, total = np.uint64(state[1]), np.uint64(state[2]), np.uint64(state[3])
     limit = total + np.uint64(max(most, 0))
@@ -239,10 +251,12 @@ def grow_by_buckets(grid, cost, buckets, scratch, state, askers, most):
     while True:
         # Cells touched from the last bucket join the queue: their cost is final.
         following = np.int32(current + 1)
+        if aim[5] < layout.INF:
+            total = filed + _leave_out(grid, cost, touched[filed:], total - filed, aim)
         waiting += _file(grid, cost, buckets, scratch, filed, total - filed, following)
         filed = total
         if most != WHOLE:
-            while asker < askers.size and cost[np.uint64(askers[asker])] < INF:
+            while asker < askers.size and cost[np.uint64(askers[asker])] < layout.INF:
                 asker += 1
             if asker == askers.size or total >= limit:
                 break
@@ -256,11 +270,11 @@ def grow_by_buckets(grid, cost, buckets, scratch, state, askers, most):
         fresh = touched[total:]
         n = take(queue, b, batch)
         waiting -= n
-        if rule == RULE_PAPER:
+        if rule == layout.RULE_PAPER:
             count = offer_around(cell_cost, cost, s, corners, batch, n, fresh)
         else:
             count = offer_straight(cell_cost, cost, s, batch, n, fresh)
-        if rule == RULE_OCTILE:
+        if rule == layout.RULE_OCTILE:
             n = take(queue, b + length, batch)
             waiting -= n
             count = offer_diagonal(cell_cost, cost, s, corners, batch, n, fresh, count)
@@ -268,16 +282,10 @@ def grow_by_buckets(grid, cost, buckets, scratch, state, askers, most):
     state[0], state[1], state[2], state[3] = current, waiting, filed, total
     if most == WHOLE:
         close_costs(cost)
-    return current if current <= 1 << 20 or waiting == _ZERO else TOO_FINE
+    return current if current <= 1 << 20 or waiting == _ZERO else layout.TOO_FINE
 
 
-def grow_whole(grid: PaddedGrid, cost: Floats, root: int, buckets: Buckets, scratch: Scratch) -> int:
-    """Costs to a padded, passable root, everywhere. Returns the last bucket, or TOO_FINE."""
-    root_only = np.array((root,))
-    return int(grow_by_buckets(grid, cost, buckets, scratch, np.empty(4, np.int64), root_only, WHOLE))
-
-
-@kernel(f"({GRID}, f4[::1], {BUCKETS}, {_SCRATCH}, i8[::1], {BOX}, f4[:, ::1], i8)")
+@kernel(f"({layout.GRID}, f4[::1], {layout.BUCKETS}, {_SCRATCH}, i8[::1], {layout.BOX}, f4[:, ::1], i8)")
 def resume(grid, cost, buckets, scratch, state, box, crop, first):
     """Goes back to a tree that was cut out (see `route_kernels`): to its costs in buckets below `first`, which are
     exact on the map as it is. Costlier cells are left to `grow_by_buckets`. `cost` is inf and WALL."""
@@ -288,14 +296,17 @@ def resume(grid, cost, buckets, scratch, state, box, crop, first):
     inverse = _ONE32 / np.float32(width)
     length = np.uint64(circle)
     mask = length - _ONE
-    empty(queue, 2 * circle if rule == RULE_OCTILE else circle)
+    empty(queue, 2 * circle if rule == layout.RULE_OCTILE else circle)
     total = _ZERO
     waiting = _ZERO
     for row in range(row0, row1):
         for col in range(col0, col1):
             c = crop[row - row0, col - col0]
             v = np.uint64(row * stride + col)
-            if not (c >= _ZERO32 and c < INF and cell_cost[v] < INF) or np.int32(c * inverse) >= first:
+            if (
+                not (c >= _ZERO32 and c < layout.INF and cell_cost[v] < layout.INF)
+                or np.int32(c * inverse) >= first
+            ):
                 continue
             cost[v] = c
             touched[total] = v
@@ -305,8 +316,8 @@ def resume(grid, cost, buckets, scratch, state, box, crop, first):
             if batch[0] >= first:
                 put(queue, one, _ONE, batch, mask, _ZERO)
                 waiting += _ONE
-            batch[0] = np.int32((c + cell_cost[v] * SQRT2) * inverse)
-            if rule == RULE_OCTILE and batch[0] >= first:
+            batch[0] = np.int32((c + cell_cost[v] * layout.SQRT2) * inverse)
+            if rule == layout.RULE_OCTILE and batch[0] >= first:
                 put(queue, one, _ONE, batch, mask, length)
                 waiting += _ONE
     state[0], state[1], state[2], state[3] = first - 1, waiting, total, total

@@ -288,42 +288,29 @@ class CostGrid:
         for row0, col0, row1, col1 in boxes:
             if not (pace[row0:row1, col0:col1] > 0).all():
                 raise ValueError(said_of_bad(pace, Window(row0, col0, row1, col1)))
-        found: list[Changes] = []
-        timed: list[Cells] = []
-        for box in boxes:
-            row0, col0, row1, col1 = box
-            most = (row1 - row0) * (col1 - col0)
-            cells = np.empty(most, np.int64)
-            before = np.empty(most, np.float32)
-            count = kernels.changed_cells(
-                pace,
-                self.metres,
-                self.length_weight_s,
-                box,
-                self.stride,
-                self.cell_cost,
-                cells,
-                before,
-            )
-            if count:
-                found.append(Changes(cells[:count], before[:count], self.cell_cost[cells[:count]]))
-                self._written[cells[:count] // _BLOCK] = True
-            if self._time_cost is not None:
-                # A change of time may be too small to be seen in a cost that holds the price of length, too.
-                room = np.empty(most, np.int64), np.empty(most, np.float32)
-                seen = kernels.changed_cells(pace, self.metres, 0.0, box, self.stride, self._time_cost, *room)
-                timed.append(room[0][:seen])
-        if self._time_cost is not None and timed:
+        # A cell in two overlapping windows changes in the first only, so there is no repetition.
+        found = [self._changed(pace, box, self.length_weight_s, self.cell_cost) for box in boxes]
+        if self._time_cost is not None and boxes:
+            # A change of time may be too small to be seen in a cost that holds the price of length, too.
+            timed = [self._changed(pace, box, 0.0, self._time_cost).cells for box in boxes]
             self._time_range.change(self._time_cost, np.concatenate(timed))
             self._lowest_time = self._time_range.lowest
-        if not found:
+        changes = joined([NO_CHANGES, *found])
+        if not changes.cells.size:
             return NO_CHANGES
-        # A cell in two overlapping windows changes in the first only, so there is no repetition.
-        changes = joined(found)
+        self._written[changes.cells // _BLOCK] = True
         self.rounding = self.rounding.after(changes)
         self._range.change(self.cell_cost, changes.cells)
         self._read_range()
         return changes
+
+    def _changed(self, pace: Floats, box: tuple[int, int, int, int], extra_s: float, costs: Floats) -> Changes:
+        """Takes a window into the padded costs, `cell_cost` or `time_cost`."""
+        row0, col0, row1, col1 = box
+        most = (row1 - row0) * (col1 - col0)
+        cells, before = np.empty(most, np.int64), np.empty(most, np.float32)
+        count = kernels.changed_cells(pace, self.metres, extra_s, box, self.stride, costs, cells, before)
+        return Changes(cells[:count], before[:count], costs[cells[:count]])
 
     def window_of(self, cells: Cells) -> Window:
         """The least window that holds these padded cells, one at least."""

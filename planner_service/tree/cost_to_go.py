@@ -102,11 +102,6 @@ class CostToGoTree:
         self.reach = reach
         self._become_exact(root)
 
-    def take_parents(self, root: int, parent: NDArray[np.uint8]) -> None:
-        """Becomes a tree that was made elsewhere on the current map, made exact by `mend`. Raises as `take`."""
-        self.take(root, np.full(self.cost_grid.size, np.inf, np.float32), parent, 0.0)
-        self.mend()
-
     def take_grown(self, root: int, growth: PartialGrowth) -> None:
         """Becomes the tree in hand of a growth that has stopped, exact as far as that went: its costs are a view of
         the growth's, and its parents are left to `point`, unless it is whole."""
@@ -136,14 +131,12 @@ class CostToGoTree:
         Returns the window that holds them. Raises ValueError unless the tree is `precise`."""
         if not self.precise:
             raise ValueError("costs are too large for float32 to tell parents by: grow the tree")
-        grid = self.cost_grid
-        row0, col0, row1, col1 = growth.box()
-        grown = np.full((row1 - row0 + 2, col1 - col0 + 2), np.inf, np.float32)
-        np.abs(growth.inside((row0, col0, row1, col1)), out=grown[1:-1, 1:-1])
-        part, box = grown.reshape(-1), (row0 - 1, col0 - 1, row1 - 1, col1 - 1)
-        merge_window(part, box, self.offset, growth.root, self.cost, grid.stride)
-        around = (max(box[0] - 1, 0), max(box[1] - 1, 0), min(row1, grid.grid.rows), min(col1, grid.grid.cols))
-        point_to_parents(grid.padded, grid.climbs, self.cost, growth.root, around, self.parent)
+        grid, grown = self.cost_grid, growth.cut()
+        row0, col0, row1, col1 = grown.box
+        part, box = np.abs(grown.cost).reshape(-1), (row0, col0, row1 - 2, col1 - 2)
+        merge_window(part, box, self.offset, grown.root, self.cost, grid.stride)
+        around = (max(row0 - 1, 0), max(col0 - 1, 0), min(row1 - 1, grid.grid.rows), min(col1 - 1, grid.grid.cols))
+        point_to_parents(grid.padded, grid.climbs, self.cost, grown.root, around, self.parent)
         self._ways_changed()
         # No cell beyond costs less than the growth's bound. The border, of which a heuristic knows nothing, is the
         # rim by which all of them come in.

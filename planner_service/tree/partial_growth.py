@@ -19,6 +19,9 @@ from shared_map.array_files import Floats
 MOST_BUCKETS = 1 << 12
 """A growth can stop if its narrow buckets are at most this number: passing that many empty buckets costs less than
 growing a whole map. With more, each growth is whole."""
+_AIMED = 4.0
+"""No growth aims at a way of more than this many times the straight one at the lowest cost: to find which cells
+may be left out takes longer than to grow them there."""
 
 
 class CutTree(NamedTuple):
@@ -88,7 +91,8 @@ class PartialGrowth:
         self.root = -1
         """The padded root of the tree in hand; -1 if there is none."""
         self.bound = 0.0
-        """s; every cell without a cost costs at least this; inf: it is unreachable."""
+        """s; every cell without a cost costs at least this; inf: it is unreachable. 0 where cells were left out,
+        and less once the map has changed: the tree in hand knows nothing of that."""
 
     @property
     def usable(self) -> bool:
@@ -114,15 +118,13 @@ class PartialGrowth:
 
     def begin(self, root: int) -> None:
         """Begins the tree of a padded, passable root."""
-        self._clear()
-        assert self._scratch is not None
-        queue_dial.begin(self.cost, root, self._scratch, self._state)
+        scratch = self._clear()
+        self.cost[root], scratch[0][0], self._state[:] = 0.0, root, (0, 0, 0, 1)
         self.root, self.bound = root, 0.0
 
     def resume(self, tree: CutTree, level: float) -> None:
         """Takes up a tree that was cut out, of which all that costs less than `level` (s) is as it was."""
-        self._clear()
-        assert self._scratch is not None
+        scratch = self._clear()
         level = min(level, tree.bound)
         if level == tree.bound < math.inf and self._width == tree.width:
             first = round(level / self._width)
@@ -132,25 +134,45 @@ class PartialGrowth:
             self.begin(tree.root)
             return
         grid, buckets = self._grid.padded, (self._width, self._circle)
-        queue_dial.resume(grid, self.cost, buckets, self._scratch, self._state, tree.box, tree.cost, first)
+        queue_dial.resume(grid, self.cost, buckets, scratch, self._state, tree.box, tree.cost, first)
         self.root = tree.root
         self._find_bound()
 
-    def go_on(self, askers: Cells, most: int) -> int:
+    def aim_at(self, askers: Cells, root: int) -> queue_dial.Aim:
+        """Returns the aim of the next growth, from a padded, passable root to such cells: none costs more than over
+        the tree in hand and its root. `NO_AIM` if that is not known, or would leave out too few cells."""
+        grid, lowest = self._grid, self._grid.lowest_cell_cost
+        if self.root < 0 or self.bound < 0 or not askers.size:
+            return queue_dial.NO_AIM
+        between = float(grid.cell_cost[root] + self.cost[root] - grid.cell_cost[self.root])
+        most = float(self.cost[askers].max()) + between * grid.dearest_step
+        most *= 1.0 + (most / lowest + 8.0) * 2.0**-22  # costs are rounded once for each step
+        rows, cols = np.divmod(askers, grid.stride)
+        row, col = divmod(root, grid.stride)
+        row0, row1, col0, col1 = rows.min(), rows.max(), cols.min(), cols.max()
+        if not most <= _AIMED * lowest * max(row0 - row, row - row1, col0 - col, col - col1):
+            return queue_dial.NO_AIM
+        return float(row0), float(col0), float(row1), float(col1), lowest, most
+
+    def go_on(self, askers: Cells, most: int, aim: queue_dial.Aim = queue_dial.NO_AIM) -> int:
         """Grows until these padded, passable cells have a cost, `most` more cells have one, or no cell is left.
-        Returns how many more have one; -1 if costs became too large for float32: then a whole growth is left."""
+        Returns how many more have one; -1 if costs became too large for float32: then a whole growth is left.
+
+        aim  which cells are left out. After such a growth, one that goes on begins again
+        """
+        if self.bound == 0.0 and self.touched > 1:
+            self.begin(self.root)
         assert self._scratch is not None
         before, buckets = self.touched, (self._width, self._circle)
-        last = queue_dial.grow_by_buckets(
-            self._grid.padded, self.cost, buckets, self._scratch, self._state, askers, most
-        )
+        grown = self._grid.padded, self.cost, buckets, self._scratch, self._state
+        last = queue_dial.grow_by_buckets(*grown, askers, most, aim)
         if last == TOO_FINE:
             return -1
-        self._find_bound()
+        self._find_bound(aim is not queue_dial.NO_AIM)
         return self.touched - before
 
-    def _find_bound(self) -> None:
-        self.bound = self.reach if self._state[1] else math.inf
+    def _find_bound(self, aimed: bool = False) -> None:
+        self.bound = 0.0 if aimed else self.reach if self._state[1] else math.inf
 
     def cut(self) -> CutTree:
         """Returns the tree in hand, as an array of its own with a rim of cells without a cost. Then none is
@@ -187,10 +209,11 @@ class PartialGrowth:
     def learn(self, changes: Changes) -> None:
         """The map has changed: the tree in hand is that of the map as it was, and cannot go on."""
         if self.cost.size and changes.cells.size:
+            self.bound = -1.0
             self.cost[changes.cells] = np.where(changes.after < np.inf, np.float32(np.inf), WALL)
 
-    def _clear(self) -> None:
-        """No tree in hand, and room for one on the map as it is now."""
+    def _clear(self) -> queue_dial.Scratch:
+        """No tree in hand, and room for one on the map as it is now, which it returns."""
         self.forget()
         width = self._narrow
         if not self.cost.size:
@@ -199,6 +222,7 @@ class PartialGrowth:
             self._width = width
             self._circle = 1 << max(2, math.ceil(math.log2(self._needed(width))))
             self._scratch = queue_dial.make_scratch(self._grid.size, self._grid.rule, self._circle)
+        return self._scratch
 
     def stays(self, tree: CutTree, changes: Changes, route: Cells) -> tuple[float, bool]:
         """Returns what changes since a tree was cut out leave of it: below which cost (s) it is as it was, and

@@ -234,7 +234,8 @@ def in_cells(tree: AnyTree) -> CostToGoTree:
     if isinstance(tree, CostToGoTree):
         return tree
     whole = CostToGoTree(tree.cost_grid)
-    whole.take_parents(tree.root, tree.parent)
+    whole.take(tree.root, np.full(whole.cost_grid.size, np.inf, np.float32), tree.parent, 0.0)
+    whole.mend()
     return whole
 
 

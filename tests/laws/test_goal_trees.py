@@ -7,6 +7,7 @@ from support.kernel_oracle import WALLS, loaded
 from support.planner_strategies import RULES, random_climb, random_pace
 
 from planner_service.goal_tree_cache import GoalTrees
+from planner_service.kernels.queue_dial import NO_AIM
 from planner_service.target_tree import TargetTree
 from planner_service.tree.partial_growth import PartialGrowth
 from shared_map.terrain.slope_and_climb import Climb
@@ -37,20 +38,30 @@ def costs_of(growth: PartialGrowth, pace: np.ndarray) -> np.ndarray:
 
 @pytest.mark.parametrize("rules", RULES)
 def test_a_growth_that_stops_is_exact_where_it_was_and_bounds_the_rest(rules: dict) -> None:
-    rng = np.random.default_rng(1)
+    rng, aimed = np.random.default_rng(1), 0
     for n in range(60):
-        pace = random_pace(rng, *rng.integers(2, 40, 2), (1.0, 3.0, 40.0, 900.0)[n % 4], WALLS[n % 4])
+        pace = random_pace(rng, *rng.integers(5, 40, 2), (1.0, 3.0, 40.0, 900.0)[n % 4], WALLS[n % 4])
         ground, goal = loaded(pace, **rules), open_cell(rng, pace)
         best = naive.cost_to_go(pace, goal, **rules).reshape(-1)
-        growth, bucket = PartialGrowth(ground), ground.lowest_cell_cost
+        growth = PartialGrowth(ground)
         growth.begin(ground.pad(goal))
-        farthest = 0.0
-        for _ in range(6):
-            if rng.random() < 0.3:  # a tree that was put down goes on like one in hand
+        farthest, asker = 0.0, goal
+        for _ in range(12):
+            changes, most, aim = rng.random() < 0.2, int(rng.choice([1 << 40, 1, 30])), NO_AIM
+            if changes:
+                growth.learn(ground.apply(pace, [marked(rng, pace, 2.0) for _ in range(20)]))
+            if rng.random() < 0.5 or np.isinf(pace.flat[asker]):
+                asker = open_cell(rng, pace)
+            if changes or rng.random() < 0.3:  # the target moves
+                beside = [cell for _, cell in ground.grid.neighbours(goal) if np.isfinite(pace.flat[cell])]
+                goal = int(rng.choice(beside or [open_cell(rng, pace)]))
+                aim = growth.aim_at(np.array([ground.pad(asker)]), ground.pad(goal))
+                growth.begin(ground.pad(goal))
+                farthest, best = 0.0, naive.cost_to_go(pace, goal, **rules).reshape(-1)
+            elif rng.random() < 0.3:  # a tree that was put down goes on like one in hand
                 growth.resume(growth.cut(), np.inf)
-            asker = open_cell(rng, pace)
-            most = int(rng.choice([1 << 40, 1, 30]))
-            growth.go_on(np.array([ground.pad(asker)]), most)
+            growth.go_on(np.array([ground.pad(asker)]), most, aim)
+            aimed += aim is not NO_AIM
             cost = costs_of(growth, pace)
             has = np.isfinite(cost)
             assert has.sum() == growth.touched
@@ -60,12 +71,13 @@ def test_a_growth_that_stops_is_exact_where_it_was_and_bounds_the_rest(rules: di
             assert has[asker] or most < 1 << 40 or best[asker] == np.inf
             # It goes no farther than the bucket of the farthest asker.
             farthest = max(farthest, best[asker])
-            if growth.bound < np.inf:
-                assert growth.bound <= farthest * (1 + ROUNDING) + bucket
+            if 0 < growth.bound < np.inf:
+                assert growth.bound <= farthest * (1 + ROUNDING) + ground.lowest_cell_cost
                 assert (cost[has] <= growth.bound * (1 + ROUNDING)).all()
         everywhere = np.flatnonzero(np.isfinite(ground.cell_cost))
         growth.go_on(everywhere, 1 << 40)
         np.testing.assert_allclose(costs_of(growth, pace), best, rtol=ROUNDING)
+    assert aimed > 20
 
 
 def price(pace: np.ndarray, cells: np.ndarray, rules: dict, climb: Climb | None = None) -> float:
@@ -188,6 +200,8 @@ def test_a_tree_follows_its_target_no_farther_than_its_askers(strategy: Strategy
         changed = [Window(w.row0 + 40, w.col0 + 40, w.row1 + 40, w.col1 + 40) for w in dirty]
         assert followed(grid.cell(60, 50 + n), near, changed) < 2_000
     assert set(kinds) == {"bounded"}
+    for n, asked in enumerate(([1], [1], [1, 0])):  # a growth that aims at one vehicle; then another asks with it
+        followed(grid.cell(60, 69 - n), grid.cell(60, 60) + 20 * np.array(asked), [])
     far = np.flatnonzero(np.isfinite(pace))[[0, -1]]
     far = far[np.isfinite(naive.cost_to_go(pace, grid.cell(60, 70), **RULES[0]).flat[far])]
     for n in range(4):

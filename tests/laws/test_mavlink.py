@@ -6,20 +6,8 @@ from typing import get_args
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from support import mavlink_world as mav
 from support.effort import few
-from support.mavlink_world import (
-    COPTER,
-    FRAME,
-    GRID,
-    MANUAL,
-    NOWHERE,
-    PLANE,
-    ROVER,
-    TO_THE_EAST,
-    WITH_A_TURN,
-    Autopilot,
-    World,
-)
 
 from launch_scripts.gateways.mavlink import mavlink_codec as codec
 from launch_scripts.gateways.mavlink.adapter import Action, Follow, Report, Unfollow
@@ -31,19 +19,30 @@ OF_THE_WHEEL = (codec.ARM_DISARM, codec.DO_SET_MODE, codec.MISSION_START, codec.
 TO_THE_VEHICLE = tuple(set(get_args(codec.Outgoing)) - {codec.Heartbeat})
 LOST_S = 3.0
 
-modes = st.sampled_from([MANUAL, 3, 4, 10, 15, 4 << 16 | 4 << 24, 6 << 16, 4 << 16 | 3 << 24, 2**32 - 1])
+modes = st.sampled_from([mav.MANUAL, 3, 4, 10, 15, 4 << 16 | 4 << 24, 6 << 16, 4 << 16 | 3 << 24, 2**32 - 1])
 kinds = st.sampled_from(
-    [(PX4, ROVER), (PX4, COPTER), (ARDUPILOT, ROVER), (ARDUPILOT, COPTER), (ARDUPILOT, PLANE), (0, 0)]
+    [
+        (PX4, mav.ROVER),
+        (PX4, mav.COPTER),
+        (ARDUPILOT, mav.ROVER),
+        (ARDUPILOT, mav.COPTER),
+        (ARDUPILOT, mav.PLANE),
+        (0, 0),
+    ]
 )
 places = st.sampled_from(
     [
-        *(FRAME.to_wgs84(*GRID.centre_m(cell)) for cell in (0, GRID.cell(40, 20), GRID.cells - 1)),
+        *(mav.FRAME.to_wgs84(*mav.GRID.centre_m(cell)) for cell in (0, mav.GRID.cell(40, 20), mav.GRID.cells - 1)),
         (36.4, -84.3), (0.0, 1.0), (90.0, 180.0), (-90.0, -180.0),
     ]
 )  # fmt: skip
 incoming = st.one_of(
     st.builds(
-        codec.Beat, st.sampled_from([0, ARDUPILOT, PX4]), st.sampled_from([0, ROVER, COPTER]), st.booleans(), modes
+        codec.Beat,
+        st.sampled_from([0, ARDUPILOT, PX4]),
+        st.sampled_from([0, mav.ROVER, mav.COPTER]),
+        st.booleans(),
+        modes,
     ),
     places.map(lambda place: codec.Position(*place, 10.0, 400.0, None)),
     st.builds(codec.ItemAsked, st.integers(0, 70)),
@@ -51,13 +50,13 @@ incoming = st.one_of(
     st.builds(codec.CommandAnswered, st.sampled_from([*OF_THE_WHEEL, 511]), st.integers(0, 6)),
     st.builds(codec.Warned, st.text(max_size=5)),
 )
-ways = st.sampled_from([TO_THE_EAST, WITH_A_TURN, NOWHERE])
+ways = st.sampled_from([mav.TO_THE_EAST, mav.WITH_A_TURN, mav.NOWHERE])
 
 
-def became(**values: object) -> Callable[[World], object]:
+def became(**values: object) -> Callable[[mav.World], object]:
     """The vehicle or the world after a change from outside."""
 
-    def become(world: World) -> None:
+    def become(world: mav.World) -> None:
         for name, value in values.items():
             setattr(world if name == "speaks" else world.vehicle, name, value)
 
@@ -88,7 +87,7 @@ steps = st.lists(
     st.sampled_from([None, "t0", "t0", "t0"]), st.booleans(), ways,
 )  # fmt: skip
 def test_whatever_comes_the_vehicle_is_told_what_it_may_be_told_and_hears_us_each_second(
-    steps: list[tuple[Callable[[World], object], int]],
+    steps: list[tuple[Callable[[mav.World], object], int]],
     kind: tuple[int, int],
     drive: str,
     arm: bool,
@@ -98,7 +97,7 @@ def test_whatever_comes_the_vehicle_is_told_what_it_may_be_told_and_hears_us_eac
     way: Way,
 ) -> None:
     wishes = Wishes(target, drive, arm, altitude_m, lost_s=LOST_S)  # type: ignore[arg-type]
-    world = World(wishes, Autopilot(*kind, answers=answers))
+    world = mav.World(wishes, mav.Autopilot(*kind, answers=answers))
     laws = Laws(world)
     laws.run(20)
     world.adapter.hear_way(way)
@@ -112,7 +111,7 @@ def test_whatever_comes_the_vehicle_is_told_what_it_may_be_told_and_hears_us_eac
 class Laws:
     """Invariants after each tick, from messages in and out alone."""
 
-    def __init__(self, world: World) -> None:
+    def __init__(self, world: mav.World) -> None:
         self.world = world
         self.heartbeat_ns = world.now_ns
         self.heard_ns = {codec.Beat: -NS_PER_S * 1000, codec.Position: -NS_PER_S * 1000}
@@ -159,7 +158,7 @@ class Laws:
                 assert self.world.adapter._swarm_up, "nobody avoids it now"
             self.one_mission(action, now_ns)
             if isinstance(action, Report):
-                FRAME.cell(action.x_m, action.y_m)
+                mav.FRAME.cell(action.x_m, action.y_m)
                 assert 0 <= action.speed_m_per_s <= 340
         assert now_ns - self.heartbeat_ns <= NS_PER_S
         assert (
@@ -198,7 +197,7 @@ looks = st.tuples(st.booleans(), modes, st.sampled_from(["drive", "hold"]), st.f
 def test_whoever_takes_the_wheel_from_us_keeps_it(
     kind: tuple[int, int], guided: bool, looks: list[tuple[bool, int, str, float, float]]
 ) -> None:
-    made = kind_of(codec.Beat(*kind, armed=False, mode=MANUAL))
+    made = kind_of(codec.Beat(*kind, armed=False, mode=mav.MANUAL))
     mode = None if made.modes is None else made.modes.guided if guided else made.modes.mission
     if guided and mode is None:
         return

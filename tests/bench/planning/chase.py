@@ -264,10 +264,8 @@ def follow(tree: TargetTree, pace: Pace, cell: int) -> Update:
     """Follows a move of the target. The tree learns how long it took, as in a planner."""
     began_ns = time.thread_time_ns()
     update = tree.update(pace, cell, [], 0)
-    if update.kind == "full":
-        tree.times.observe_full_ns(time.thread_time_ns() - began_ns)
-    elif update.kind == "exact":
-        tree.times.observe_exact_ns(time.thread_time_ns() - began_ns)
+    if update.kind in ("full", "bounded", "exact"):
+        tree.times.observe(update.kind, time.thread_time_ns() - began_ns)
     return update
 
 

@@ -15,17 +15,7 @@ from support.makers import stats
 from support.monitor_rig import hill
 
 from launch_scripts.check.scenario_check import network
-from launch_scripts.monitor.movers_view import (
-    OVER_S,
-    RouteLines,
-    RouteNow,
-    Trails,
-    alarm_marks,
-    cells_at,
-    searched_points,
-    target_labels,
-    vehicle_details,
-)
+from launch_scripts.monitor import movers_view as view
 from launch_scripts.monitor.rerun_outputs import Pen, RateLimit, Strips
 from launch_scripts.monitor.styles import HUES, LOST_COLOUR, Looks
 from launch_scripts.monitor.terrain_mesh import TerrainMesh
@@ -49,11 +39,11 @@ def columns(states: list[VehicleState], targets: list[int], target_ids: list[str
     return VehicleColumns(ids, *places, np.array(states, np.uint8), np.array(targets, np.int64), target_ids)
 
 
-def route(*cells: int, target: str = "t0", cols: int = 1000, **more: Any) -> RouteNow:
+def route(*cells: int, target: str = "t0", cols: int = 1000, **more: Any) -> view.RouteNow:
     """A route over these cells of a grid with that number of columns."""
     of_grid = np.array(cells, np.int32)
     places = np.stack(np.divmod(of_grid, cols), axis=1).astype(np.float32)
-    return RouteNow(target, of_grid, places, **more)
+    return view.RouteNow(target, of_grid, places, **more)
 
 
 def followed(start: int, directions: bytes, *legs: int) -> Followed:
@@ -126,7 +116,7 @@ def test_who_points_at_a_vehicle_reads_who_it_is_and_what_it_does() -> None:
     vehicles = columns([state.FOLLOWING, state.ARRIVED, state.STRANDED, state.WAITING], [0, 1, -1, 1], ["t0", "t1"])
     begun = route(1, 2, gap=1.0125, begun_ns=3 * NS_PER_S)
     groups = dict.fromkeys(vehicles.ids[:3], "all")
-    assert vehicle_details(vehicles, groups, {"a0-00": begun, "a0-03": begun}, 5 * NS_PER_S) == [
+    assert view.vehicle_details(vehicles, groups, {"a0-00": begun, "a0-03": begun}, 5 * NS_PER_S) == [
         "a0-00 to t0: following, route 2 s old, certified gap 1.25%; all",
         "a0-01 to t1: arrived; all",
         "a0-02: stranded; all",
@@ -140,7 +130,7 @@ ids = st.sampled_from(["t0", "t1", "t2", "t3"])
 @settings(deadline=None)
 @given(st.sets(ids), st.sets(ids), st.sets(ids))
 def test_every_target_that_is_drawn_has_one_label(posed: set[str], lost: set[str], seen: set[str]) -> None:
-    pins, sightings = target_labels(sorted(posed), lost, seen)
+    pins, sightings = view.target_labels(sorted(posed), lost, seen)
     assert not pins.keys() & sightings.keys()
     assert pins.keys() | sightings.keys() == posed | seen
     for id in posed - lost:
@@ -161,21 +151,23 @@ def test_every_target_that_is_drawn_has_one_label(posed: set[str], lost: set[str
 )  # fmt: skip
 def test_alarms_are_marked_where_they_are_until_they_have_been_over_for_a_while(alarms: list[Alarm]) -> None:
     grid = hill(20, 20).grid
-    marks = alarm_marks(alarms, 50.0, {"t0": (30.0, 40.0)}, grid)
+    marks = view.alarm_marks(alarms, 50.0, {"t0": (30.0, 40.0)}, grid)
     assert len(marks) <= 24
     assert all(0 <= east_m <= 200 and 0 <= south_m <= 200 for east_m, south_m in marks)
-    seen = {f"{each.label}: {each.about}" for each in alarms if each.over_s is None or each.over_s >= 50 - OVER_S}
+    seen = {
+        f"{each.label}: {each.about}" for each in alarms if each.over_s is None or each.over_s >= 50 - view.OVER_S
+    }
     assert set(marks.values()) <= seen
     assert bool(marks) == any(
         f"{each.label}: {each.about}" in seen and (each.place(grid) or each.target == "t0") for each in alarms
-        if each.over_s is None or each.over_s >= 50 - OVER_S
+        if each.over_s is None or each.over_s >= 50 - view.OVER_S
     )  # fmt: skip
 
 
 def test_an_alarm_has_the_place_of_its_cell_or_of_its_target() -> None:
     def places(**about: Any) -> list[tuple[float, float]]:
         alarm = Alarm(kind="down", text=".", since_s=0.0, **about)
-        return list(alarm_marks([alarm], 9.0, {"t0": (30.0, 40.0)}, hill(20, 20).grid))
+        return list(view.alarm_marks([alarm], 9.0, {"t0": (30.0, 40.0)}, hill(20, 20).grid))
 
     assert places(about="x", cell=21, target="t0") == [(15.0, 15.0)]
     assert places(about="planner-t0", target="t0") == [(30.0, 40.0)]
@@ -193,7 +185,7 @@ def believed(cells: list[int], shares: list[float], target: str = "t0") -> Belie
 
 def test_the_likelier_a_target_is_somewhere_the_less_transparent_is_that_drawn_on_the_ground() -> None:
     mesh = TerrainMesh(hill(20, 30))
-    positions, colours, radii_m, details = searched_points(
+    positions, colours, radii_m, details = view.searched_points(
         mesh, [believed([65, 10 * 30, 20 * 30], [0.5, 0.1, 0.2])]
     )
     assert len(positions) == len(colours) == len(radii_m) == 2, "a cell outside of the map is not drawn"
@@ -201,7 +193,7 @@ def test_the_likelier_a_target_is_somewhere_the_less_transparent_is_that_drawn_o
     assert details == ["t0 may be here: 50.0%", "t0 may be here: 10.0%"]
     ground = mesh.place(np.array([55.0, 5.0], np.float32), np.array([25.0, 105.0], np.float32), 0.1 * mesh.scale_m)
     assert np.allclose(positions, ground)
-    assert len(searched_points(mesh, [])[0]) == 0
+    assert len(view.searched_points(mesh, [])[0]) == 0
 
 
 def test_what_is_left_of_a_route_begins_where_the_vehicle_is() -> None:
@@ -214,8 +206,12 @@ def test_a_pulled_route_leads_straight_from_turn_to_turn_beside_the_cells_of_its
     """From the middle of cell (0, 0) straight to (2, 4), and east to (2, 6)."""
     steps = bytes(code for code in (2, 3, 2, 3, 2, 2))
     grid = hill(10, 20).grid
-    pulled = RouteNow.of(followed(0, steps, 4, 2), grid, 0)
-    assert pulled.cells.tolist() == walk(grid, 0, steps) == RouteNow.of(followed(0, steps), grid, 0).cells.tolist()
+    pulled = view.RouteNow.of(followed(0, steps, 4, 2), grid, 0)
+    assert (
+        pulled.cells.tolist()
+        == walk(grid, 0, steps)
+        == view.RouteNow.of(followed(0, steps), grid, 0).cells.tolist()
+    )
     assert pulled.places.tolist() == [[0, 0], [0.5, 1], [1, 2], [1.5, 3], [2, 4], [2, 5], [2, 6]]
     assert pulled.ahead_of(22).places[0].tolist() == [1, 2]
 
@@ -223,7 +219,7 @@ def test_a_pulled_route_leads_straight_from_turn_to_turn_beside_the_cells_of_its
 @pytest.mark.parametrize(("start", "wrong"), [(0, bytes([0])), (19, bytes([2])), (200, b""), (41, bytes([8]))])
 def test_no_route_leads_off_the_map(start: int, wrong: bytes) -> None:
     with pytest.raises(ValueError, match=r"."):
-        RouteNow.of(followed(start, wrong), hill(10, 20).grid, 0)
+        view.RouteNow.of(followed(start, wrong), hill(10, 20).grid, 0)
 
 
 def on_tree(parents: list[int], start: int) -> list[int]:
@@ -243,7 +239,7 @@ def test_routes_of_one_tree_are_drawn_whole_and_no_part_of_them_twice(data: st.D
     starts = data.draw(st.lists(st.integers(0, nodes - 1), max_size=12))
     mesh = TerrainMesh(hill(1, nodes))
     routes = [route(*on_tree(parents, start)) for start in starts]
-    lines = RouteLines(mesh, 1)
+    lines = view.RouteLines(mesh, 1)
     for _ in range(2):  # earlier drawings leave nothing behind
         strips = lines.lines(routes)
         drawn = []
@@ -255,7 +251,7 @@ def test_routes_of_one_tree_are_drawn_whole_and_no_part_of_them_twice(data: st.D
 
 
 def test_a_trail_grows_by_what_was_driven_and_breaks_where_something_jumped() -> None:
-    trails = Trails(longest_m=100.0)
+    trails = view.Trails(longest_m=100.0)
 
     def at(*east_m: float) -> NDArray[np.float32]:
         return np.array([[e, 0, 0] for e in east_m], np.float32)
@@ -273,7 +269,7 @@ def test_a_trail_grows_by_what_was_driven_and_breaks_where_something_jumped() ->
 def test_a_place_outside_the_grid_is_taken_for_the_nearest_cell() -> None:
     grid = hill(10, 20).grid
     east_m, south_m = np.array([15.0, -1.0], np.float32), np.array([25.0, 1e6], np.float32)
-    assert cells_at(grid, east_m, south_m).tolist() == [2 * 20 + 1, 9 * 20]
+    assert view.cells_at(grid, east_m, south_m).tolist() == [2 * 20 + 1, 9 * 20]
 
 
 @pytest.mark.parametrize("name", ["a0-99", "t3x", "\x1b[31m", "a0-07", "t3"])

@@ -11,19 +11,8 @@ import pytest
 from support.planner_play import Play
 from support.planner_strategies import Job, Marks, Move, random_pace
 
-from planner_service.growth_times import MODEL_EXACT_NS_PER_CELL, GrowthTimes
-from planner_service.strategy import (
-    ROWS,
-    STAGES,
-    STRATEGIES,
-    Growths,
-    OnMove,
-    Stage,
-    StrategyRow,
-    StrategyWorld,
-    strategy_of,
-    whole_trees_only,
-)
+from planner_service import strategy as strategies
+from planner_service.growth_times import MODEL_EXACT_NS_PER_CELL, MODEL_NEAR_NS_PER_CELL, NEAR_CELLS, GrowthTimes
 from planner_service.target_tree import TargetTree
 from planner_service.tree import partitioned_tree
 from swarm.config.plugin_names import PLUGIN_KINDS, NamedPlugin
@@ -35,7 +24,7 @@ from swarm.plugins import Plugin
 GRID = GridSpec(96, 96, 1.0)
 
 
-def kinds_of_moves(config: PlannerConfig, row: StrategyRow, moves: int) -> list[str]:
+def kinds_of_moves(config: PlannerConfig, row: strategies.StrategyRow, moves: int) -> list[str]:
     """The growth at each move of one cell to the east; "!" if a full growth, "~" if strides were asked for."""
     pace = np.ones((GRID.rows, GRID.cols), np.float32)
     tree = TargetTree(GRID, config, chosen_by=row)
@@ -46,19 +35,22 @@ def kinds_of_moves(config: PlannerConfig, row: StrategyRow, moves: int) -> list[
 
 
 def test_every_strategy_of_the_scenario_has_a_row_and_every_row_a_name() -> None:
-    assert set(STRATEGIES) == {*ROWS, "auto"} == set(get_args(Strategy))
-    assert set(STAGES) == set(get_args(Stage))
+    assert set(strategies.STRATEGIES) == {*strategies.ROWS, "auto"} == set(get_args(Strategy))
+    assert set(strategies.STAGES) == set(get_args(strategies.Stage))
 
 
 @pytest.mark.parametrize(
     ("row", "expected"),
     [
-        (StrategyRow(OnMove.WHOLE_TREE), ["full"] * 5),
-        (StrategyRow(OnMove.BLOCK_WINDOW), ["window"] * 5),
-        (StrategyRow(OnMove.BLOCK_WINDOW, thins_far_cells=True), ["window~"] * 5),
-        (StrategyRow(OnMove.SCHEDULED_WINDOW), ["window"] * 5),
-        (StrategyRow(OnMove.EXACT_MOVE), ["exact"] * 5),
-        (StrategyRow(OnMove.SCHEDULED_WINDOW, renews_within_budget=True), ["window", "window", "exact"] * 2),
+        (strategies.StrategyRow(strategies.OnMove.WHOLE_TREE), ["full"] * 5),
+        (strategies.StrategyRow(strategies.OnMove.BLOCK_WINDOW), ["window"] * 5),
+        (strategies.StrategyRow(strategies.OnMove.BLOCK_WINDOW, thins_far_cells=True), ["window~"] * 5),
+        (strategies.StrategyRow(strategies.OnMove.SCHEDULED_WINDOW), ["window"] * 5),
+        (strategies.StrategyRow(strategies.OnMove.EXACT_MOVE), ["exact"] * 5),
+        (
+            strategies.StrategyRow(strategies.OnMove.SCHEDULED_WINDOW, renews_within_budget=True),
+            ["window", "window", "exact"] * 2,
+        ),
     ],
 )
 def test_a_tree_does_what_its_row_says_whatever_the_strategy_is_called(row, expected):
@@ -69,18 +61,19 @@ def test_a_tree_does_what_its_row_says_whatever_the_strategy_is_called(row, expe
 
 def test_until_all_kernels_are_compiled_every_row_grows_whole_trees() -> None:
     for row in every_row():
-        whole = whole_trees_only(row)
-        assert whole.on_move is OnMove.WHOLE_TREE
+        whole = strategies.whole_trees_only(row)
+        assert whole.on_move is strategies.OnMove.WHOLE_TREE
         assert not whole.thins_far_cells
         assert whole.renews_loose_bounds == row.renews_loose_bounds
 
 
-def every_row() -> list[StrategyRow]:
-    hints = get_type_hints(StrategyRow)
+def every_row() -> list[strategies.StrategyRow]:
+    hints = get_type_hints(strategies.StrategyRow)
     values = [
-        (False, True) if hints[field.name] is bool else tuple(hints[field.name]) for field in fields(StrategyRow)
+        (False, True) if hints[field.name] is bool else tuple(hints[field.name])
+        for field in fields(strategies.StrategyRow)
     ]
-    return [StrategyRow(*each) for each in product(*values)]
+    return [strategies.StrategyRow(*each) for each in product(*values)]
 
 
 ASKED_TIMES = 7
@@ -95,7 +88,7 @@ class AnyRow:
         order = np.random.default_rng(1).permutation(len(rows))
         self.rows = [rows[order[(seed * ASKED_TIMES + n) % len(rows)]] for n in range(ASKED_TIMES)]
 
-    def row(self, growths: Growths) -> StrategyRow:
+    def row(self, growths: strategies.Growths) -> strategies.StrategyRow:
         return self.rows.pop() if len(self.rows) > 1 else self.rows[0]
 
 
@@ -126,20 +119,20 @@ def plugged(answer: Any) -> tuple[Any, list[str]]:
     """A strategy whose plug-in gives this answer, its messages."""
 
     class Answers:
-        def row(self, growths: Growths) -> Any:
+        def row(self, growths: strategies.Growths) -> Any:
             return answer() if callable(answer) else answer
 
     named = NamedPlugin(PLUGIN_KINDS["strategy"], "planner.strategy", "my:Own", {})
     told: list[str] = []
     plugin = Plugin(named, lambda world, options: Answers(), {})
-    return strategy_of(plugin, StrategyWorld("t", GRID, PlannerConfig()), told.append), told
+    return strategies.strategy_of(plugin, strategies.StrategyWorld("t", GRID, PlannerConfig()), told.append), told
 
 
-ASKED = Growths(1e6, 1e7, 64, GRID.cells, 4e5)
+ASKED = strategies.Growths(1e6, 1e7, 64, GRID.cells, 4e5)
 
 
 def test_a_plugins_row_is_in_force() -> None:
-    row = StrategyRow(OnMove.BLOCK_WINDOW, renews_within_budget=True)
+    row = strategies.StrategyRow(strategies.OnMove.BLOCK_WINDOW, renews_within_budget=True)
     strategy, told = plugged(row)
     assert strategy.row(ASKED) == row
     assert TargetTree(GRID, PlannerConfig(strategy="my:Own"), chosen_by=strategy).strategy == row
@@ -152,14 +145,17 @@ def test_a_plugins_row_is_in_force() -> None:
         (lambda: 1 / 0, "raised ZeroDivisionError"),
         (None, "returned NoneType, expected a StrategyRow"),
         ("full", "returned str, expected a StrategyRow"),
-        (StrategyRow("whole tree"), "on_move is 'whole tree', expected a OnMove"),  # type: ignore[arg-type]
-        (StrategyRow(OnMove.WHOLE_TREE, thins_far_cells=1), "thins_far_cells is 1, expected a bool"),  # type: ignore[arg-type]
+        (strategies.StrategyRow("whole tree"), "on_move is 'whole tree', expected a OnMove"),  # type: ignore[arg-type]
+        (
+            strategies.StrategyRow(strategies.OnMove.WHOLE_TREE, thins_far_cells=1),
+            "thins_far_cells is 1, expected a bool",
+        ),  # type: ignore[arg-type]
     ],
 )
 def test_a_strategy_that_fails_is_named_and_trees_stay_exact(answer: object, said: str) -> None:
     strategy, told = plugged(answer)
-    assert strategy.row(ASKED).on_move is OnMove.EXACT_MOVE
-    assert strategy.row(ASKED).on_move is OnMove.EXACT_MOVE
+    assert strategy.row(ASKED).on_move is strategies.OnMove.EXACT_MOVE
+    assert strategy.row(ASKED).on_move is strategies.OnMove.EXACT_MOVE
     (fault,) = told
     assert "strategy plug-in 'my:Own' of planner.strategy: row r" in fault
     assert said in fault
@@ -174,17 +170,17 @@ def test_growths_that_took_long_as_they_were_cut_up_do_not_leave_a_large_tree_to
     assert times.exact_ns < 20e6  # `bench moves --size 4096` measures 10 ms, where a growth takes 30 times as long
     for tick in range(200):
         times.note_tick(tick % 16 == 0)
-    assert times.row.on_move is OnMove.EXACT_MOVE
+    assert times.row.on_move is strategies.OnMove.EXACT_MOVE
     for _ in range(2):
-        assert times.row.on_move is OnMove.EXACT_MOVE  # one slow move may have had cold caches
+        assert times.row.on_move is strategies.OnMove.EXACT_MOVE  # one slow move may have had cold caches
         times.observe_exact_ns(200_000_000)
     assert not times.mends_quickly
-    assert times.row.on_move is not OnMove.EXACT_MOVE
+    assert times.row.on_move is not strategies.OnMove.EXACT_MOVE
 
 
 def test_auto_keeps_a_dear_tree_exact_for_a_target_that_moves_seldom() -> None:
     grid = GridSpec(2048, 2048, 10.0)
-    for every, stage in ((20, OnMove.EXACT_MOVE), (1, OnMove.SCHEDULED_WINDOW)):
+    for every, stage in ((20, strategies.OnMove.EXACT_MOVE), (1, strategies.OnMove.SCHEDULED_WINDOW)):
         times = GrowthTimes(grid, PlannerConfig(cpu_budget=0.1), True, False, None)
         times.observe_full_ns(150_000_000)
         for _ in range(3):
@@ -192,6 +188,24 @@ def test_auto_keeps_a_dear_tree_exact_for_a_target_that_moves_seldom() -> None:
         for tick in range(200):
             times.note_tick(tick % every == 0)
         assert times.row.on_move is stage
+
+
+@pytest.mark.parametrize("side", [128, 256, 512, 1024, 2048, 4096])
+def test_auto_takes_the_cheaper_of_a_growth_to_the_askers_and_an_exact_move_and_stays_with_it(side: int) -> None:
+    """On a machine no faster than the one of the models, with times that vary by a tenth."""
+    chance, grid = np.random.default_rng(side), GridSpec(side, side, 10.0)
+    for _ in range(20):
+        times, whole = GrowthTimes(grid, PlannerConfig(cpu_budget=1.0), False, False, None), False
+        per_cell_ns, exact_ns = chance.uniform(1, 4, 2) * (MODEL_NEAR_NS_PER_CELL, times.exact_ns)
+        for half in chance.integers(4, side // 2, 4).tolist():
+            times.note_near((2 * half) ** 2)
+            taken, costs_ns = [], {"bounded": ((2 * half) ** 2 + NEAR_CELLS) * per_cell_ns, "exact": exact_ns}
+            for _ in range(30):
+                taken.append("bounded" if times.stops(whole) else "exact")
+                times.observe(taken[-1], int(costs_ns[taken[-1]] * chance.uniform(0.9, 1.1)))
+                whole = taken[-1] == "exact"
+            assert sum(before != after for before, after in itertools.pairwise(taken)) <= 2, taken
+            assert costs_ns[taken[-1]] <= 1.25 / strategies.HYSTERESIS * min(costs_ns.values())
 
 
 def large_tree(clock: Iterator[int] | None = None) -> tuple[TargetTree, np.ndarray, GridSpec]:
@@ -202,8 +216,9 @@ def large_tree(clock: Iterator[int] | None = None) -> tuple[TargetTree, np.ndarr
     pace = np.ones((grid.rows, grid.cols), np.float32)
     tree._askers.note(np.array([0]), grid.cells)  # from everywhere: a growth that stops would save nothing
     tree.update(pace, grid.cell(100, 100), [], 0)
-    tree.times.observe_full_ns(10**9)
-    assert tree.strategy.on_move is OnMove.EXACT_MOVE
+    for kind in ("full", *["bounded"] * 3):
+        tree.times.observe(kind, 10**9)
+    assert tree.strategy.on_move is strategies.OnMove.EXACT_MOVE
     return tree, pace, grid
 
 
@@ -219,7 +234,7 @@ def test_a_large_tree_in_pieces_is_not_turned_into_one_with_all_costs_between_tw
     tree, pace, grid = large_tree()
     for _ in range(3):
         tree.times.observe_exact_ns(300_000_000)
-    assert tree.strategy.on_move is OnMove.SCHEDULED_WINDOW
+    assert tree.strategy.on_move is strategies.OnMove.SCHEDULED_WINDOW
     update = tree.update(pace, grid.cell(100, 101), [], 0)
     assert (update.kind, update.cells, update.wants_full) == ("none", 0, True)
     assert (tree.ready, tree.target_cell) == (True, grid.cell(100, 100))  # and it says where it leads meanwhile
@@ -233,7 +248,7 @@ def test_a_tree_in_pieces_that_a_worker_brings_late_is_not_turned_into_one_with_
     grown = tree.full_job(grid.cell(100, 101))()  # asked for while the row in force was exact
     for _ in range(3):
         tree.times.observe_exact_ns(300_000_000)
-    assert tree.strategy.on_move is OnMove.SCHEDULED_WINDOW
+    assert tree.strategy.on_move is strategies.OnMove.SCHEDULED_WINDOW
     monkeypatch.setattr(partitioned_tree, "in_cells", lambda each: pytest.fail("turned into one with all costs"))
     update = tree.adopt(grown, pace, grid.cell(100, 102), [], 0, np.empty(0, np.int64))
     assert (tree.target_cell, update.wants_full) == (grid.cell(100, 101), True)
@@ -254,10 +269,10 @@ def test_a_load_that_has_ended_brings_a_large_tree_back_to_exact_moves() -> None
     times.observe_full_ns(400_000_000)
     for _ in range(3):
         times.observe_exact_ns(30_000_000)
-    assert times.row.on_move is OnMove.SCHEDULED_WINDOW
+    assert times.row.on_move is strategies.OnMove.SCHEDULED_WINDOW
     for _ in range(3):
         times.observe_full_ns(70_000_000)
-    assert times.row.on_move is OnMove.EXACT_MOVE
+    assert times.row.on_move is strategies.OnMove.EXACT_MOVE
 
 
 def test_windows_do_not_forget_that_vehicles_are_far_and_grow_no_tree_to_find_it_out() -> None:

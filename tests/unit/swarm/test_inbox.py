@@ -10,21 +10,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from swarm.bus.bus import (
-    QUESTION_BYTES,
-    QUESTION_COST_BYTES,
-    Appeared,
-    Asked,
-    AskEnded,
-    Disappeared,
-    Event,
-    Heard,
-    HeardMany,
-    LinkChanged,
-    Replied,
-    Undecoded,
-    WorkDone,
-)
+from swarm.bus import bus
 from swarm.peers import Peer
 from swarm.runtime.inbox import CAPACITY, PER_ASKER_BYTES, FairQueue, Inbox
 from swarm.wire.messages import Nothing
@@ -32,8 +18,8 @@ from swarm.wire.messages.planning import TargetPose
 from swarm.wire.messages.processes import Note
 from swarm.wire.topics import COST, NAMELESS_ROUTE, NOTE, ROUTE, RUN, TRUE_POSE, Topic
 
-MOST = QUESTION_BYTES // QUESTION_COST_BYTES
-PER_ASKER = PER_ASKER_BYTES // QUESTION_COST_BYTES
+MOST = bus.QUESTION_BYTES // bus.QUESTION_COST_BYTES
+PER_ASKER = PER_ASKER_BYTES // bus.QUESTION_COST_BYTES
 
 
 class Time:
@@ -56,10 +42,10 @@ class Asker:
 
     def __post_init__(self) -> None:
         self.asked_s = self.time.now_s
-        self.question = Asked(self.topic, {"asker": self.name}, Nothing(), self)
-        self.undecoded = Undecoded(self.topic, self, self.decode, self.name)
+        self.question = bus.Asked(self.topic, {"asker": self.name}, Nothing(), self)
+        self.undecoded = bus.Undecoded(self.topic, self, self.decode, self.name)
 
-    def decode(self) -> Asked | None:
+    def decode(self) -> bus.Asked | None:
         self.decoded += 1
         return None if self.rejected else self.question
 
@@ -76,14 +62,14 @@ class Asker:
         self.ended_s = self.time.now_s
 
 
-def note(n: object) -> Heard:
+def note(n: object) -> bus.Heard:
     message = Note(role="agent", id="a0", stamp_ns=1, kind="k", text=str(n))
-    return Heard(NOTE, {"role": "agent", "id": "a0"}, message)
+    return bus.Heard(NOTE, {"role": "agent", "id": "a0"}, message)
 
 
-def pose(target: str, seq: int) -> Heard:
+def pose(target: str, seq: int) -> bus.Heard:
     message = TargetPose(target=target, incarnation=1, seq=seq, stamp_ns=5, cell=3, x_m=1.0, y_m=2.0)
-    return Heard(TRUE_POSE, {"target": target}, message)
+    return bus.Heard(TRUE_POSE, {"target": target}, message)
 
 
 @pytest.fixture
@@ -96,12 +82,12 @@ def clock() -> Time:
     return Time()
 
 
-def post_all(inbox: Inbox, events: Iterable[Event]) -> None:
+def post_all(inbox: Inbox, events: Iterable[bus.Event]) -> None:
     for event in events:
         inbox.post(event)
 
 
-def drain(inbox: Inbox) -> list[Event]:
+def drain(inbox: Inbox) -> list[bus.Event]:
     taken = []
     while (event := inbox.take(0)) is not None:
         taken.append(event)
@@ -136,8 +122,8 @@ def test_many_threads_may_post(inbox):
         assert [e.message.seq for e in taken if e.fields.get("target") == name] == [499]
 
 
-def batch(n: int) -> HeardMany:
-    return HeardMany(NOTE, [(f"note/agent/a{n}", note(n).message)])
+def batch(n: int) -> bus.HeardMany:
+    return bus.HeardMany(NOTE, [(f"note/agent/a{n}", note(n).message)])
 
 
 def test_who_brings_batches_waits_until_the_owner_has_kept_up(inbox):
@@ -205,9 +191,9 @@ def test_the_keys_of_which_the_newest_is_kept_are_bounded_too(inbox):
 
 def test_replies_tokens_links_and_results_are_never_dropped(inbox):
     peer = Peer("agent", "a0", 7)
-    kept: list[Event] = [
-        *(Replied("q", RUN, {}, Nothing()) for _ in range(CAPACITY)), AskEnded("q", RUN, CAPACITY, None),
-        *(Appeared(peer), Disappeared(peer), LinkChanged(up=True), WorkDone("grow", 1, 1)),
+    kept: list[bus.Event] = [
+        *(bus.Replied("q", RUN, {}, Nothing()) for _ in range(CAPACITY)), bus.AskEnded("q", RUN, CAPACITY, None),
+        *(bus.Appeared(peer), bus.Disappeared(peer), bus.LinkChanged(up=True), bus.WorkDone("grow", 1, 1)),
     ]  # fmt: skip
     post_all(inbox, kept)
     post_all(inbox, (note(n) for n in range(2 * CAPACITY)))
@@ -267,7 +253,7 @@ def test_without_overload_questions_and_samples_come_in_the_order_of_their_arriv
         Asker(clock, topic=ROUTE).question,
         note(2),
         Asker(clock).question,
-        LinkChanged(up=False),
+        bus.LinkChanged(up=False),
     ]
     post_all(inbox, events)
     clock.now_s = 0.4
@@ -303,7 +289,7 @@ def test_while_questions_come_late_samples_and_other_questions_take_turns_with_t
     post_all(inbox, (note(n) for n in range(3)))
     taken = [inbox.take(0) for _ in range(10)]
     assert route.question in taken[:3]
-    assert [event for event in taken if isinstance(event, Heard)] == [note(n) for n in range(3)]
+    assert [event for event in taken if isinstance(event, bus.Heard)] == [note(n) for n in range(3)]
 
 
 @pytest.mark.parametrize(
