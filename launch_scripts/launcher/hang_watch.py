@@ -22,6 +22,8 @@ import contextlib
 from dataclasses import dataclass
 from typing import NamedTuple
 
+import psutil
+
 STILL_S = 60.0
 """A loop that has not ticked for this time does not recover. Much longer than `HUNG_S`, from which on probes fail:
 restarts do not help an overloaded machine."""
@@ -77,8 +79,6 @@ class Stillness:
 
 def sight_of(pid: int | None) -> Sight | None:
     """Returns the main thread of a process as the system shows it; None if there is none."""
-    import psutil  # the launcher needs none to start
-
     with contextlib.suppress(psutil.Error):
         process = psutil.Process(pid or 0)
         used_s = next((each.user_time + each.system_time for each in process.threads() if each.id == pid), 0.0)
@@ -94,8 +94,6 @@ class IdleTime:
 
     def any_until(self, now_s: float) -> bool:
         """Returns True if a processor was idle since the last call."""
-        import psutil
-
         times = psutil.cpu_times()
         idle_s = times.idle + getattr(times, "iowait", 0.0)
         any_idle = idle_s - self._idle_s >= _IDLE_SHARE * (now_s - self._at_s)

@@ -11,11 +11,11 @@ import re
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated
 
 import msgspec
+import psutil
 
 from swarm.config.input_files import FileKind, read_text
 from swarm.errors import StoreError, SwarmError
@@ -65,8 +65,6 @@ class KnownRun:
     @property
     def is_stopped(self) -> bool:
         """Returns True if a launcher is stopped, as by Ctrl-Z or SIGSTOP."""
-        import psutil
-
         with suppress(psutil.Error):
             return any(psutil.Process(pid).status() == psutil.STATUS_STOPPED for pid in self.launchers)
         return False
@@ -79,9 +77,7 @@ def registry() -> Path:
 
 def register(folder: Path, *, web_port: int = 0, is_whole: bool = False) -> str | None:
     """Registers this process as a launcher of the run in a folder, or changes its entry. Returns a sentence if that
-    is impossible. An install without psutil, which has no launcher, registers nothing."""
-    if find_spec("psutil") is None:
-        return None
+    is impossible."""
     try:
         entry = _Entry(
             folder=str(folder.resolve()),
@@ -140,18 +136,12 @@ def _entries() -> Iterator[tuple[Path, _Entry]]:
 
 def _started_s(pid: int) -> float:
     """Start of a process, in seconds since the machine was started."""
-    import psutil
-
     boot_s = psutil.boot_time()  # first: releases of psutil keep it for the next line
     return float(psutil.Process(pid).create_time() - boot_s)
 
 
 def _runs(entry: _Entry) -> bool:
     """Returns True if the launcher still runs: another process may have its pid by now."""
-    if find_spec("psutil") is None:
-        return False
-    import psutil
-
     with suppress(psutil.Error):
         process = psutil.Process(entry.pid)
         mine = process.uids().real == os.getuid() and process.status() != psutil.STATUS_ZOMBIE
@@ -162,8 +152,6 @@ def _runs(entry: _Entry) -> bool:
 def is_of_a_swarm(pid: int) -> bool:
     """Returns True if a process may be sent a signal: another program can log into the folder of a run, and an
     entry of the registry can name any process."""
-    import psutil
-
     with suppress(psutil.Error):
         return re.search("swarm|launch_scripts", " ".join(psutil.Process(pid).cmdline())) is not None
     return False
@@ -180,8 +168,6 @@ def logging_into(folder: Path, logs: Iterable[tuple[int, Path]] | None = None) -
 
 def open_logs() -> Iterator[tuple[int, Path]]:
     """Yields (pid, file) for each log file that a process of this user has open for writing."""
-    import psutil
-
     for process in psutil.process_iter():
         with suppress(psutil.Error, OSError):  # ended meanwhile, or of another user
             for path in {file.path for file in process.open_files() if file.mode != "r" and ".log" in file.path}:

@@ -11,6 +11,8 @@ import json
 import math
 import os
 import platform
+import shutil
+import subprocess
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +29,8 @@ RUNS = Path("runs")
 are not registered."""
 LAST = "LAST"
 """In the folder of all runs: a link to the newest."""
-_PACKAGES = {"terrain_swarm": "terrain-swarm", "zenoh": "eclipse-zenoh", "numba": "numba", "numpy": "numpy"}
+OURS = "terrain-swarm"
+_PACKAGES = {"terrain_swarm": OURS, "zenoh": "eclipse-zenoh", "numba": "numba", "numpy": "numpy"}
 
 
 def begin_run(
@@ -146,11 +149,19 @@ def _number(text: str) -> float:
 
 
 def version_of(package: str) -> str | None:
-    """The version of an installed package; None where it is not installed."""
+    """The version of an installed package, with the commit if it is ours in a checkout; None where it is not
+    installed."""
     try:
-        return importlib.metadata.version(package)
+        said = importlib.metadata.version(package)
     except importlib.metadata.PackageNotFoundError:
         return None
+    root = Path(__file__).parents[2]
+    if package != OURS or not (root / ".git").exists() or not shutil.which("git"):
+        return said
+    # The editable installation of a checkout outlives the commit that it was made from (hatch_build.py).
+    asked = ["git", "-C", str(root), "rev-parse", "--short=12", "HEAD"]
+    commit = subprocess.run(asked, capture_output=True, text=True, check=False).stdout.strip()
+    return "+g".join(filter(None, (said.partition("+")[0], commit)))
 
 
 def _now() -> str:
