@@ -32,7 +32,7 @@ _ENOUGH_FILES = 1024
 _EXTRAS = ("", "planner", "terrain", "roles", "vectors", "view")
 """The base and the extras of a swarm: each brings the packages of some before it."""
 _ALWAYS = 3
-"""Of these, what this command itself needs."""
+"""Number of these which this command itself needs."""
 _UNSYNCHRONISED = 5
 """Result of `adjtimex` for a clock that is not synchronised: TIME_ERROR."""
 _TIMEX_BYTES = 256
