@@ -30,9 +30,8 @@ _ENOUGH_BYTES = 1 << 30
 _ENOUGH_FILES = 1024
 """Open files that a process may need; fewer are warned of. Chosen, not measured."""
 _EXTRAS = ("", "planner", "terrain", "roles", "vectors", "view")
-"""The base and the extras of a swarm: each brings the packages of some before it."""
-_ALWAYS = 3
-"""Number of these which this command itself needs."""
+"""The base and the extras of a swarm: each brings the packages of some before it. This command itself needs the
+first three."""
 _UNSYNCHRONISED = 5
 """Result of `adjtimex` for a clock that is not synchronised: TIME_ERROR."""
 _TIMEX_BYTES = 256
@@ -194,7 +193,7 @@ def _packages(runs: Path) -> Said:
     brings = Counter(extra for extra, _ in extra_of.values())
     there = Counter(extra for name, (extra, _) in extra_of.items() if here[name])
     # No installer records extras. Another program may have brought a few of the packages.
-    absent = [extra for extra in _EXTRAS[_ALWAYS:] if 2 * there[extra] < brings[extra]]
+    absent = [extra for extra in _EXTRAS[3:] if 2 * there[extra] < brings[extra]]
     wrong = [
         f"{name} is {here[name] or 'missing'}, expected {each.specifier} ({extra or 'always'})"
         for name, (extra, each) in extra_of.items()
