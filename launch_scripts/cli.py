@@ -3,12 +3,8 @@
 from __future__ import annotations
 
 import inspect
-import shutil
-import subprocess
 import textwrap
 from functools import cache, reduce
-from importlib.metadata import version
-from pathlib import Path
 from pkgutil import resolve_name
 from typing import Annotated, Any
 
@@ -88,13 +84,9 @@ app = typer.Typer(
 
 def _version(wanted: bool) -> None:
     if wanted:
-        said, root = version("terrain-swarm"), Path(__file__).parents[1]
-        if (root / ".git").exists() and shutil.which("git"):
-            # A checkout: its editable installation outlives the commit that it was made from (hatch_build.py).
-            asked = ["git", "-C", str(root), "rev-parse", "--short=12", "HEAD"]
-            commit = subprocess.run(asked, capture_output=True, text=True, check=False).stdout.strip()
-            said = "+g".join(filter(None, (said.partition("+")[0], commit)))
-        typer.echo(f"swarm {said}")
+        from launch_scripts.observe.run_folders import OURS, version_of
+
+        typer.echo(f"swarm {version_of(OURS)}")
         raise typer.Exit
 
 

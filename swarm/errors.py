@@ -9,8 +9,8 @@ EXTRAS = {
     "typer": "terrain", "rich": "terrain", "numpy": "planner", "numba": "planner", "llvmlite": "planner",
     "PIL": "terrain", "matplotlib": "terrain", "packaging": "terrain", "rasterio": "terrain", "scipy": "terrain",
     "yaml": "terrain", "cryptography": "roles", "jinja2": "roles", "markupsafe": "roles",
-    "prometheus_client": "roles", "psutil": "roles", "setproctitle": "roles", "rerun": "view", "dask": "sweep",
-    "pyogrio": "vectors", "shapely": "vectors", "pyproj": "wgs84", "pymavlink": "mavlink", "serial": "mavlink",
+    "prometheus_client": "roles", "psutil": "terrain", "setproctitle": "roles", "rerun": "view", "dask": "sweep",
+    "pyogrio": "vectors", "shapely": "roles", "pyproj": "wgs84", "pymavlink": "mavlink", "serial": "mavlink",
     "mcap": "ros2", "rosbags": "ros2", "xxhash": "ros2", "distributed": "sweep", "pyarrow": "sweep",
 }  # fmt: skip
 """Package that the base install lacks -> the smallest extra which brings it."""

@@ -13,6 +13,7 @@ import sys
 import tomllib
 from collections import Counter
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -27,8 +28,9 @@ from launch_scripts.typer_commands import Family
 from shared_map.importers.cover.land_cover import TABLES
 from shared_map.importers.zones.zone_features import BUILT_IN, COLUMNS
 
-_REFERENCE = Path(__file__).parents[1] / "reference"
-_DESIGN = Path(__file__).parents[1] / "design"
+_DOCS = Path(__file__).parents[1]
+_REFERENCE, _DESIGN = _DOCS / "reference", _DOCS / "design"
+_PROGRAM = re.compile(r"(\[`docs/(examples/\w+\.py)`\].*\n\n(?:<!--.*-->\n\n)?```python\n)(?:.*\n)*?(?=```)")
 _MEASUREMENTS = tomllib.loads(Path(__file__).with_name("measurements.toml").read_text(encoding="utf-8"))
 _QOS = {
     "DEFAULT": "reliable, volatile, last 10",
@@ -93,6 +95,12 @@ def design() -> str:
     return filled("design", titles=titles)
 
 
+def with_programs(page: Path) -> str:
+    """Returns a page with the current text of the programs which it shows below a link to their file."""
+    text = page.read_text(encoding="utf-8").removesuffix("\n")
+    return _PROGRAM.sub(lambda found: found[1] + (_DOCS / found[2]).read_text(encoding="utf-8"), text)
+
+
 PAGES: dict[Path, Callable[[], str]] = {
     wire_page.PATH: wire_page.document,
     wire_page.JSON_PATH: wire_page.json_document,
@@ -104,6 +112,7 @@ PAGES: dict[Path, Callable[[], str]] = {
     _REFERENCE.with_name("method") / "measurements.md": lambda: filled("measurements", **_MEASUREMENTS),
     _REFERENCE / "ros2.md": ros2,
     _DESIGN / "index.md": design,
+    **{page: partial(with_programs, page) for page in _DOCS.glob("*/*.md") if _PROGRAM.search(page.read_text())},
 }
 """File -> what makes its text, without the line end at its end."""
 

@@ -10,13 +10,14 @@ import platform
 import resource
 import shutil
 import time
+from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
 from launch_scripts.check import Finding, Level, failure, warning
 from launch_scripts.deploy.machines_needed import needs_on, swarm_of
-from launch_scripts.observe.run_folders import version_of
+from launch_scripts.observe.run_folders import OURS, version_of
 from launch_scripts.process_table import processes_of
 from swarm.config import scenario as settings
 from swarm.config.input_files import size
@@ -24,13 +25,13 @@ from swarm.config.scenario import NetworkConfig, Scenario
 from swarm.errors import StoreError, SwarmError
 from swarm.files import check_writable
 
-PACKAGE = "terrain-swarm"
 _ENOUGH_BYTES = 1 << 30
 """Minimum of free memory, and of free disk."""
 _ENOUGH_FILES = 1024
 """Open files that a process may need; fewer are warned of. Chosen, not measured."""
-_LARGEST_FIRST = ("all", "view", "vectors", "roles", "terrain", "planner")
-"""Extras of a swarm: each brings more packages than those after it."""
+_EXTRAS = ("", "planner", "terrain", "roles", "vectors", "view")
+"""The base and the extras of a swarm: each brings the packages of some before it. This command itself needs the
+first three."""
 _UNSYNCHRONISED = 5
 """Result of `adjtimex` for a clock that is not synchronised: TIME_ERROR."""
 _TIMEX_BYTES = 256
@@ -178,31 +179,31 @@ def examine(runs: Path) -> Iterator[Finding]:
             yield warning(about, f"cannot be looked at: {error}")
 
 
-def _python(runs: Path) -> Said:
-    from packaging.specifiers import SpecifierSet
-
-    wanted = importlib.metadata.metadata(PACKAGE)["Requires-Python"] or ""
-    here = platform.python_version()
-    if not SpecifierSet(wanted).contains(here, prereleases=True):
-        return "failure", f"{here}, expected {wanted}; make an environment with a newer one"
-    return "ok", f"{here} ({wanted})"
-
-
 def _packages(runs: Path) -> Said:
     from packaging.requirements import Requirement
 
-    every = list(map(Requirement, importlib.metadata.requires(PACKAGE) or ()))
-    wrong: dict[str, str] = {}
-    for extra in _LARGEST_FIRST:  # so that the smallest that brings a package remains
-        for wanted in every:
-            if wanted.marker is not None and not wanted.marker.evaluate({"extra": extra}):
-                continue
-            here = version_of(wanted.name)
-            if here is None or not wanted.specifier.contains(here, prereleases=True):
-                wrong[wanted.name] = f"{wanted.name} is {here or 'missing'}, expected {wanted.specifier} ({extra})"
+    every = list(map(Requirement, importlib.metadata.requires(OURS) or ()))
+    here = {each.name: version_of(each.name) for each in every}
+    extra_of = {
+        each.name: (extra, each)
+        for extra in reversed(_EXTRAS)  # so that the smallest that brings a package remains
+        for each in every
+        if each.marker is None or each.marker.evaluate({"extra": extra})
+    }
+    brings = Counter(extra for extra, _ in extra_of.values())
+    there = Counter(extra for name, (extra, _) in extra_of.items() if here[name])
+    # No installer records extras. Another program may have brought a few of the packages.
+    absent = [extra for extra in _EXTRAS[3:] if 2 * there[extra] < brings[extra]]
+    wrong = [
+        f"{name} is {here[name] or 'missing'}, expected {each.specifier} ({extra or 'always'})"
+        for name, (extra, each) in extra_of.items()
+        if extra not in absent and not each.specifier.contains(here[name] or "0", prereleases=True)
+    ]
     if wrong:
-        return "failure", f"{'; '.join(wrong.values())}: install the extras in brackets (docs/start/install.md)"
-    return "ok", f"all fit; {PACKAGE} {version_of(PACKAGE)}, zenoh {version_of('eclipse-zenoh')}"
+        return "failure", f"{'; '.join(wrong)}: install the extras in brackets (docs/start/install.md)"
+    without = f"; not installed: the extras {', '.join(absent)} (docs/start/install.md)" if absent else ""
+    python, zenoh = platform.python_version(), here["eclipse-zenoh"]
+    return "ok", f"all fit; {OURS} {version_of(OURS)}, zenoh {zenoh}, Python {python}{without}"
 
 
 def _planner_kernels(runs: Path) -> Said:
@@ -284,7 +285,7 @@ def _disk(runs: Path) -> Said:
 CHECKS: dict[str, Callable[[Path], Said]] = {
     look.__name__.strip("_").replace("_", " "): look
     for look in (
-        _python, _packages, _planner_kernels, _cores, _memory, _open_files, _zenoh, _clock, _disk,
+        _packages, _planner_kernels, _cores, _memory, _open_files, _zenoh, _clock, _disk,
     )
 }  # fmt: skip
 """The checks by their names, in order."""

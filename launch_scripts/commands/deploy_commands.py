@@ -129,7 +129,7 @@ def _show(made: Plan, kit: KitName) -> None:
     console = Console(highlight=False)
     console.print(table)
     machines = number_of(len(made.hosts), "machine")
-    without = f"continues without any {made.survive} of its {machines}, of which the vehicles then stand"
+    without = f"survives the loss of any {made.survive} of its {machines}; the vehicles of a lost machine stand"
     what = f"the run {without if made.survive else 'needs every machine'}"
     console.print(f"run {made.run_id}: {number_of(len(made.processes), 'process')}; {what}", soft_wrap=True)
     if kit == "systemd":

@@ -22,6 +22,7 @@ from subprocess import DEVNULL, PIPE, STDOUT, Popen
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import msgspec
+import psutil
 import typer
 
 from launch_scripts.commands import shared_options
@@ -226,7 +227,7 @@ def ps(all: Annotated[bool, typer.Option("--all", "-a")] = False, as_json: AsJso
 
 @command(app, RUN)
 def down(run: RunArgument = None) -> int:
-    """End a run of this machine as Ctrl-C does, and wait for its report.
+    """End a run of this machine as Ctrl-C does, and wait for its report: up to a minute on a busy machine.
 
     If the run has not ended, a second `swarm down` kills the processes that are left. If the launcher is gone, the
     first one kills them.
@@ -235,8 +236,6 @@ def down(run: RunArgument = None) -> int:
 
     run  Name of the run, or its folder. May be omitted if exactly one run is running here.
     """
-    import psutil
-
     from launch_scripts.launcher.console import Terminal, what_is_left
     from launch_scripts.observe.run_folders import is_of_a_swarm, read_report
 
@@ -260,7 +259,7 @@ def down(run: RunArgument = None) -> int:
                 )
             process.send_signal(signal.SIGINT)
             process.resume()  # a stopped one does not hear before
-    with terminal.busy(f"run {found.name} ends"):
+    with terminal.busy(f"run {found.name} ends and writes its report"):
         while (left := _run_in(found.folder).launchers) and time.monotonic() < until_s:
             time.sleep(_TURN_S)
     if left:
@@ -343,8 +342,6 @@ def kill(process: Annotated[str, typer.Argument(metavar="ROLE-ID")], run: RunOpt
     process  The process, such as planner-t3.
     run      Name of the run, or its folder. May be omitted if exactly one run is running here.
     """
-    import psutil
-
     found = _chosen(run, only=True)
     running = found.processes()
     again = "its launcher starts it again" if found.launchers else "it had no launcher any more"

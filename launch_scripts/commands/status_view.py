@@ -40,7 +40,7 @@ if TYPE_CHECKING:
 _SHOWN_ALARMS, _SHOWN_ON_TOP = 12, 3
 """Alarms of `status` and of `top`, whose table has to fit a terminal."""
 _SHOWN_GOALS = 24
-"""Vehicles that were sent to places, of `status`."""
+"""Vehicles that were sent to places, and external vehicles with their places, of `status`."""
 _LISTEN_S, _TOP_LISTEN_S, _MOST_S = 1.5, 2.2, 4.0
 """A picture is drawn after this time, and that of `top`, whose rates need two of the figures that each process
 sends once a second; later while a process that has answered has not said how it is."""
@@ -70,7 +70,11 @@ class Status:
         latest = self.latest
         expected = dict.fromkeys((*latest.plan.crew_now(latest.plan.targets_now(latest.book)), *latest.up()))
         answered = {(info.role, info.id) for info in (*self.members, *self.strangers)}
-        return [f"{role}-{id}" for role, id in expected if role in ROLES and (role, id) not in answered]
+        return [
+            f"{role}-{id}"
+            for role, id in expected
+            if role in ROLES and (role, id) not in answered and not latest.has_ended(role, id)
+        ]
 
     @property
     def state(self) -> RunState:
@@ -140,6 +144,9 @@ def print_status(status: Status, console: Console) -> None:
         cell = _target_cell(planner, frame)
         if frame is not None and cell is not None:
             say(f"{id} {'was' if planner.tracker_lost else 'is'} at {written(frame, cell)}")
+    for id, outside in list(status.latest.external(status.now_ns).items())[:_SHOWN_GOALS]:
+        if frame is not None and (at := frame.grid.cell_at(outside.x_m, outside.y_m)) >= 0:
+            say(f"{id} is at {written(frame, at)}")
     for ordered in state.orders:
         say(f"ordered: {ordered}", "yellow")
     for goal in state.goals[:_SHOWN_GOALS]:

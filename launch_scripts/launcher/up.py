@@ -355,7 +355,7 @@ class _Run:
         self._health.turned(known.observed, self._started_ns, self._missing(watcher), up)
         if (sentence := self._disk.check_room(time.monotonic())) is not None:
             self._terminal.say(sentence, "red")
-        for note in watcher.take_notes():
+        for note in watcher.take_notes(starting=self._startup_s is None):
             self._terminal.say(f"{note.role}-{note.id}: {note.text}", "cyan")
         if watcher.web_port not in (0, self._web_port):
             self._say_page(watcher.web_port)

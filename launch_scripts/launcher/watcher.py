@@ -143,10 +143,11 @@ class Watcher(RunObserver):
     def now_ns(self) -> int:
         return self._clock.now_ns()
 
-    def take_notes(self) -> list[Note]:
-        """Notes of processes to the user since the last call."""
+    def take_notes(self, *, starting: bool = False) -> list[Note]:
+        """Notes of processes to the user since the last call; while the swarm starts, none about slow answers, as
+        processes which load are slow."""
         notes, self.notes = self.notes, []
-        return notes
+        return [note for note in notes if not (starting and note.kind in ("waiting", "slow_link"))]
 
     def take(self, event: Event, now_ns: int) -> None:
         """Takes in one event."""

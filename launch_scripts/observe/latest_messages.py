@@ -421,10 +421,10 @@ class LatestState(Counts):
         """Returns True if the agent has published its vehicles."""
         return agent in self._fleet_told_ns
 
-    def external(self, now_ns: int) -> tuple[str, ...]:
-        """Returns the ids of the external vehicles and other obstacles whose lease has not ended, in order."""
+    def external(self, now_ns: int) -> dict[str, Obstacle]:
+        """Returns the external vehicles and other obstacles whose lease has not ended, in order of id."""
         reports = sorted(self._obstacles.items())
-        return tuple(id for id, (each, heard_ns) in reports if now_ns - heard_ns < each.lease_s * NS_PER_S)
+        return {id: each for id, (each, heard_ns) in reports if now_ns - heard_ns < each.lease_s * NS_PER_S}
 
     def goals(self) -> list[GoalState]:
         """Progress of the vehicles that were sent to places, without those that were recalled."""

@@ -259,10 +259,10 @@ def _by_group(latest: LatestState, by_vehicle: Mapping[str, Any], classes: Mappi
 
 
 def _gap_fields(gap: CertifiedGap | None) -> dict[str, Any]:
-    return {"routes": gap.routes, "certified_gap": gap.fields()} if gap and gap.routes else _NO_GAP
+    return {"routes_begun": gap.routes, "certified_gap": gap.fields()} if gap and gap.routes else _NO_GAP
 
 
-_NO_GAP: dict[str, Any] = {"routes": 0, "certified_gap": None}
+_NO_GAP: dict[str, Any] = {"routes_begun": 0, "certified_gap": None}
 
 
 # --- the recorder -------------------------------------------------------------------------------------------------

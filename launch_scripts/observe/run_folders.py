@@ -16,14 +16,16 @@ import math
 import os
 import platform
 import re
+import shutil
+import subprocess
 from collections.abc import Iterable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
-from importlib.util import find_spec
 from pathlib import Path
 from typing import Annotated, Any
 
 import msgspec
+import psutil
 
 from swarm.config.input_files import FileKind, read_text
 from swarm.config.scenario import Scenario
@@ -75,8 +77,6 @@ class KnownRun:
     @property
     def is_stopped(self) -> bool:
         """Returns True if a launcher is stopped, as by Ctrl-Z or SIGSTOP."""
-        import psutil
-
         with suppress(psutil.Error):
             return any(psutil.Process(pid).status() == psutil.STATUS_STOPPED for pid in self.launchers)
         return False
@@ -89,9 +89,7 @@ def registry() -> Path:
 
 def register(folder: Path, *, web_port: int = 0, is_whole: bool = False) -> str | None:
     """Registers this process as a launcher of the run in a folder, or changes its entry. Returns a sentence if that
-    is impossible. An install without psutil, which has no launcher, registers nothing."""
-    if find_spec("psutil") is None:
-        return None
+    is impossible."""
     try:
         entry = _Entry(
             folder=str(folder.resolve()),
@@ -150,18 +148,12 @@ def _entries() -> Iterator[tuple[Path, _Entry]]:
 
 def _started_s(pid: int) -> float:
     """Start of a process, in seconds since the machine was started."""
-    import psutil
-
     boot_s = psutil.boot_time()  # first: releases of psutil keep it for the next line
     return float(psutil.Process(pid).create_time() - boot_s)
 
 
 def _runs(entry: _Entry) -> bool:
     """Returns True if the launcher still runs: another process may have its pid by now."""
-    if find_spec("psutil") is None:
-        return False
-    import psutil
-
     with suppress(psutil.Error):
         process = psutil.Process(entry.pid)
         mine = process.uids().real == os.getuid() and process.status() != psutil.STATUS_ZOMBIE
@@ -172,8 +164,6 @@ def _runs(entry: _Entry) -> bool:
 def is_of_a_swarm(pid: int) -> bool:
     """Returns True if a process may be sent a signal: another program can log into the folder of a run, and an
     entry of the registry can name any process."""
-    import psutil
-
     with suppress(psutil.Error):
         return re.search("swarm|launch_scripts", " ".join(psutil.Process(pid).cmdline())) is not None
     return False
@@ -190,8 +180,6 @@ def logging_into(folder: Path, logs: Iterable[tuple[int, Path]] | None = None) -
 
 def open_logs() -> Iterator[tuple[int, Path]]:
     """Yields (pid, file) for each log file that a process of this user has open for writing."""
-    import psutil
-
     for process in psutil.process_iter():
         with suppress(psutil.Error, OSError):  # ended meanwhile, or of another user
             for path in {file.path for file in process.open_files() if file.mode != "r" and ".log" in file.path}:
@@ -204,7 +192,8 @@ RUNS = Path("runs")
 are not registered."""
 LAST = "LAST"
 """In the folder of all runs: a link to the newest."""
-_PACKAGES = {"terrain_swarm": "terrain-swarm", "zenoh": "eclipse-zenoh", "numba": "numba", "numpy": "numpy"}
+OURS = "terrain-swarm"
+_PACKAGES = {"terrain_swarm": OURS, "zenoh": "eclipse-zenoh", "numba": "numba", "numpy": "numpy"}
 
 
 def begin_run(
@@ -323,11 +312,19 @@ def _number(text: str) -> float:
 
 
 def version_of(package: str) -> str | None:
-    """The version of an installed package; None where it is not installed."""
+    """The version of an installed package, with the commit if it is ours in a checkout; None where it is not
+    installed."""
     try:
-        return importlib.metadata.version(package)
+        said = importlib.metadata.version(package)
     except importlib.metadata.PackageNotFoundError:
         return None
+    root = Path(__file__).parents[2]
+    if package != OURS or not (root / ".git").exists() or not shutil.which("git"):
+        return said
+    # The editable installation of a checkout outlives the commit that it was made from (hatch_build.py).
+    asked = ["git", "-C", str(root), "rev-parse", "--short=12", "HEAD"]
+    commit = subprocess.run(asked, capture_output=True, text=True, check=False).stdout.strip()
+    return "+g".join(filter(None, (said.partition("+")[0], commit)))
 
 
 def _now() -> str:

@@ -32,7 +32,7 @@ class TargetLine:
     planner_up  whether its planner or one of its standbys is as it should be
     starting    whether none of them has been seen yet, in the first seconds of a run
     rank        of the planner that leads; 0 unless a standby does
-    following   vehicles that go for it
+    following   vehicles of the swarm that go for it: where an external vehicle goes is not published
     nearest_m   distance of the nearest vehicle
     growths     how often its tree was grown or repaired
     growth_ms   CPU time of the last full search
@@ -87,7 +87,7 @@ class RunState:
     driven_into       vehicles that drove into an obstacle which had said in time where it is; must be 0
     hit_by_obstacles  the obstacles' own fault
     reroute_requests  how often a vehicle's own route did not lead it on, so that it asked for another
-    routes_served     routes that planners gave
+    routes_served     routes that planners gave in answer to questions; those which they pushed come on top
     marks             marks that vehicles made since the last start of their agents
     messages_per_s    messages that all processes send now
     payloads_dropped  messages that were none of this swarm, or came under a key that is not their sender's
@@ -176,7 +176,7 @@ def state_of(latest: LatestState, now_ns: int) -> RunState:
         messages_per_s=latest.now_of(MESSAGES_PER_S),
         well=(sum(well), len(crew)),
         ended=sum(latest.has_ended(role, id) for role, id in crew),
-        external=latest.external(now_ns),
+        external=tuple(latest.external(now_ns)),
         restarts=round(latest.gauge(RESTARTS) or 0),
         crew={role: (alive[role], expected[role]) for role in expected},
         beside=dict(Counter(role for role, id in latest.up() if (role, id) not in needed)),

@@ -29,7 +29,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shared_map.terrain.map_frame import MapFrame
-from swarm.errors import ConfigError, StoreError
+from swarm.errors import ConfigError, StoreError, require
 from swarm.files import check_writable, replacing, write_file
 from swarm.grid import GridSpec
 
@@ -112,6 +112,8 @@ def check_target(path: Path | None, option: str, *endings: str, force: bool = Fa
         raise ConfigError(f"{option} {path}: cannot write there, the folder {path.parent} does not exist")
     if path.is_file() and not force:
         raise ConfigError(f"{option} {path}: the file exists; --force replaces it")
+    if FORMATS.get(path.suffix.lower()):
+        require("the command", "pyogrio", "shapely")
     check_writable(path.parent, file=path)
 
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import contextlib
 import csv
-import importlib.metadata
 import io
 import json
 import math
@@ -27,7 +26,7 @@ from numpy.typing import NDArray
 from launch_scripts.observe.latest_messages import MarkedCells
 from launch_scripts.observe.palette import image_bytes
 from launch_scripts.observe.recorder import Recorder
-from launch_scripts.observe.run_folders import REPORT_FILE, ended
+from launch_scripts.observe.run_folders import OURS, REPORT_FILE, ended, version_of
 from shared_map.learned_factors import factors_in, learned_kinds
 from shared_map.terrain.terrain import Level, Terrain
 from shared_map.terrain.terrain_report import bounds_deg
@@ -53,7 +52,7 @@ def with_series(numbers: Mapping[str, Any], recorder: Recorder, terrain: Terrain
     """The numbers of a run, its terrain and its course."""
     return {
         **numbers,
-        "version": importlib.metadata.version("terrain-swarm"),
+        "version": version_of(OURS),
         "terrain": {
             "digest": terrain.digest,
             **asdict(terrain.grid),

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import marshal
 import sys
 import tomllib
 import venv
+import warnings
+from collections.abc import Iterable
+from contextlib import suppress
 from functools import cache
 from importlib.metadata import Distribution, distribution
 from pathlib import Path
@@ -34,9 +38,23 @@ def packages(*extras: str) -> dict[str, Distribution]:
     return found
 
 
-def megabytes(found: dict[str, Distribution]) -> float:
-    paths = [Path(str(file.locate())) for each in found.values() for file in each.files or ()]
-    return sum(path.stat().st_size for path in paths if path.suffix != ".pyc" and path.is_file()) / 2**20
+def files_of(found: dict[str, Distribution]) -> list[Path]:
+    return [Path(str(file.locate())) for each in found.values() for file in each.files or ()]
+
+
+def megabytes(paths: Iterable[Path]) -> float:
+    """Size of files with the byte code that pip writes beside each module."""
+    files = [path for path in paths if path.suffix != ".pyc" and path.is_file()]
+    modules = [path for path in files if path.suffix == ".py" and "bin" not in path.parts]
+    return (sum(path.stat().st_size for path in files) + sum(map(_code_bytes, modules))) / 2**20
+
+
+@cache
+def _code_bytes(module: Path) -> int:
+    """Size of a module's byte code; 0 of a file that is for another Python."""
+    with warnings.catch_warnings(action="ignore"), suppress(SyntaxError, ValueError):
+        return len(marshal.dumps(compile(module.read_bytes(), str(module), "exec", dont_inherit=True)))
+    return 0
 
 
 def environment(folder: Path, *extras: str) -> Path:

@@ -17,6 +17,7 @@ from support.makers import route_reply, run_info
 from launch_scripts import ports
 from launch_scripts.commands.swarm_route import Answer, as_json, show, write
 from launch_scripts.launcher import run_options
+from launch_scripts.observe.run_folders import begin_run, run_facts
 from launch_scripts.observe.run_observer import frame_of_members
 from shared_map.terrain.map_frame import MapFrame
 from swarm.config.scenario import MonitorConfig, Scenario, TlsConfig
@@ -28,9 +29,13 @@ from swarm.wire.messages.processes import RunInfo
 from swarm.wire.route_columns import Route, RouteBatch, RouteStatus
 
 
-def test_the_version_is_the_packages_with_the_commit_of_a_checkout(swarm: Swarm) -> None:
+def test_the_version_is_the_packages_with_the_commit_of_a_checkout_as_in_a_run(
+    swarm: Swarm, tmp_path: Path
+) -> None:
     code, said, errors = swarm("--version")
     assert (code, errors, said.partition("+")[0].strip()) == (0, "", f"swarm {version('terrain-swarm')}")
+    begin_run(tmp_path, run_options.find_scenario("jacksboro"), "run")
+    assert said == f"swarm {run_facts(tmp_path)['versions']['terrain_swarm']}\n"
 
 
 def test_help_is_quick_because_it_imports_neither_zenoh_nor_numpy() -> None:

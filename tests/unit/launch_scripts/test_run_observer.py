@@ -15,8 +15,10 @@ from swarm.bus.bus import Appeared, AskEnded, Disappeared, Heard, Replied
 from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec
 from swarm.peers import Peer
+from swarm.runtime.stats import ENDED
 from swarm.wire.messages.orders import GoalState, GoalStates
 from swarm.wire.messages.processes import Stats
+from swarm.wire.messages.vehicles import Obstacle
 from swarm.wire.topics import FLEET, RUN, STATS
 
 INFO = keeper_info(GridSpec(40, 50, 10.0))
@@ -137,12 +139,21 @@ def test_vehicles_that_were_sent_somewhere_are_shown_with_their_state_and_those_
     assert "sent to places 1 blocked" in text
     assert "a0-02" not in text
     assert [each["name"] for each in status_fields(status)["goals"]] == ["a0-01"]
+    # An external vehicle has a line of its place, but one off the terrain.
+    for id, x_m in (("away", -1e6), ("rover", 225.0)):
+        status.latest.heard(Obstacle(id=id, incarnation=1, seq=1, x_m=x_m, y_m=-135.0, radius_m=1.0), 0)
+    text = printed(status)
+    assert "external vehicles away, rover" in text
+    assert "rover is at cell:1,2 (xy:225,-135)" in text
+    assert "away is at" not in text
 
 
 def test_an_upgrade_under_way_is_shown_with_those_that_speak_the_older_version() -> None:
     status = told_by(a0=8, a1=9, a2=9)
     assert "an upgrade is under way: wire version 9, but 8 of agent-a0" in printed(status)
     assert "1 of 4 did not answer within 4 s: agent-gone" in printed(status)
+    status.latest.heard(makers.stats(id="gone", stamp_ns=2, gauges={ENDED: 1.0}), 0)
+    assert "did not answer" not in printed(status)
     assert {each["id"]: each["wire_version"] for each in status_fields(status)["processes"]} == {
         "a0": 8, "a1": 9, "a2": 9,
     }  # fmt: skip

@@ -68,8 +68,12 @@ def test_the_first_route_that_is_begun_says_that_routes_are_served_and_the_other
     agent = swarm.bus("agent")
     for _ in range(3):
         agent.publish(FOLLOWED, followed(), agent="a0", vehicle="a0-00")
+        for kind in ("waiting", "x"):
+            agent.publish(NOTE, Note(role="agent", id="a0", stamp_ns=1, kind=kind, text=""), role="agent", id="a0")
         swarm.run(0.1)
         watcher.listen(0.0)
+        # While the swarm starts, no slow answer is told.
+        assert [note.kind for note in watcher.take_notes(starting=True)] == ["x"]
     assert watcher.routes_served
     assert sum(isinstance(message, Followed) for message in heard) == 1
 
