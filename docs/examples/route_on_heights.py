@@ -1,12 +1,12 @@
 """Routes on an array of heights, by the rules of a hiker. Needs the extra `terrain`."""
 
 import numpy as np
-from swarm.config.cost_rules import cost_of_preset
 
 from planner_service import RouteFinder
 from shared_map.terrain.terrain import build_terrain
 from swarm.config.ground import TerrainConfig
 from swarm.config.scenario import Scenario
+from swarm.config.vehicle_classes import cost_of_preset
 
 rows, cols = np.mgrid[0:100, 0:200]  # row 0 is in the north
 heights_m = 300 * np.exp(-((rows - 50) ** 2 + (cols - 100) ** 2) / 800)  # a hill
