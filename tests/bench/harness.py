@@ -129,16 +129,17 @@ def benchmark(
 
 def track(items: Iterable[_T]) -> Iterator[_T]:
     """Yields the items, and shows on standard error how many are done."""
-    if _bar is None:
+    bar = _bar
+    if bar is None:
         yield from items
         return
-    task = _bar.add_task("", total=len(items) if isinstance(items, Sized) else None)
+    task = bar.add_task("", total=len(items) if isinstance(items, Sized) else None)
     try:
         for item in items:
             yield item
-            _bar.advance(task)
+            bar.advance(task)
     finally:
-        _bar.remove_task(task)
+        bar.remove_task(task)
 
 
 def tell(text: str) -> None:

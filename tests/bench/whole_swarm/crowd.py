@@ -6,18 +6,19 @@ its target not within reach, whatever the reason.
 
 from __future__ import annotations
 
-import functools
 import math
-import multiprocessing
+import signal
 import time
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import Annotated, Any
 
 import typer
 
 from bench.harness import benchmark, names_of, track
-from bench.isolated import TimeLimit
+from bench.isolated import TimeLimit, isolated
 from bench.whole_swarm.ideal_crowd import drive_ideal
+from launch_scripts.parent_death import end_with_parent
 from launch_scripts.simulation import sample_worlds as crowded
 from launch_scripts.simulation.sample_worlds import CROWDS
 from launch_scripts.simulation.trials import parse_seeds
@@ -102,6 +103,7 @@ def drive_crowd(vehicles: int, agents: int, side: int, seconds: float, which: tu
     from swarm.bus.bus import Event, Heard
     from swarm.wire.topics import FLEET
 
+    end_with_parent(signal.SIGKILL)
     kind, seed = which
     scenario, terrain = crowded.crowd(kind, seed, vehicles, -(-vehicles // agents), side)
     began_s = time.perf_counter()
@@ -191,11 +193,9 @@ def crowd(
     if 4 * vehicles > size * size:
         raise ConfigError(f"--vehicles is {vehicles}, expected at most a quarter of {size} x {size} cells")
     items = [(kind, seed) for seed in some for kind in chosen]
-    work = functools.partial(drive_crowd, vehicles, agents, size, seconds)
-    # Processes of their own, not forks: numpy and numba have threads. They end with the block.
-    with multiprocessing.get_context("spawn").Pool(jobs) as pool:
-        results = pool.imap_unordered(work, items)
-        drives = [next(results) for _ in track(items)]
+    with ThreadPoolExecutor(jobs) as pool:
+        work = [pool.submit(isolated, drive_crowd, vehicles, agents, size, seconds, each) for each in items]
+        drives = [each.result() for each in track(work)]
     drives.sort(key=lambda each: (chosen.index(each["world"]), each["seed"]))
     rows = [row_of(kind, [each for each in drives if each["world"] == kind]) for kind in chosen]
     if len(chosen) > 1:
