@@ -303,7 +303,9 @@ class Holdings:
         if granted.agent != self.shards.leader(granted.shard, granted.epoch) or granted.stamp < knows:
             return []
         view.leader, view.heard_ns = granted.agent, now_ns
-        if (whole := granted.whole(view.used)) is None:
+        # One to another generation says nothing but that: a replaced one lacks the base, and has to learn of it.
+        whole = granted.whole(view.used) if granted.generation == self.generation else granted
+        if whole is None:
             return []
         if not self.shards.proven:
             return self._take(view, whole)
@@ -491,8 +493,8 @@ class Holdings:
             ended=self.replaced,
             never=sorted(self._entries.never(shard)),
         )
-        # Of others than agents a leader keeps no earlier statement: a stranger costs it little memory.
-        reads = members == (view.leader,) and self.name in self.shards.agents
+        # Of strangers, and where an agent may lie, a leader keeps no earlier statement: they cost it little memory.
+        reads = members == (view.leader,) and self.name in self.shards.agents and not self.shards.proven
         base = view.sent.get(view.heard) if reads else None
         keep_last(view.sent, self._seq, standing, STATES_KEPT)
         return Tell(members, standing if base is None else standing.changes(base))

@@ -86,7 +86,7 @@ class _Host:
               request nothing now
     spoke_ns  time of the last message, of any of its generations: a replaced one is informed
     told      the last grant to it, and its time
-    said      (generation, seq) -> statement, the last ones of an agent
+    said      (generation, seq) -> statement, the last ones of an agent, unless certificates prove names
     changes   whether the newest was sent as changes: then so are grants
     """
 
@@ -201,7 +201,7 @@ class Leader:
         self._changed |= self._orders.by_host_count(host) != before
         self.seq = max(self.seq, self._orders.newest - 1)  # the next table is not older than its entries
         known.standing, known.stands, known.heard_ns = standing, stands, now_ns
-        if host in self._fleets:
+        if host in self._fleets and not self._shards.proven:
             keep_last(known.said, (standing.generation, standing.seq), standing, STATES_KEPT)
         known.asking = [stand for stand in stands.values() if stand.ahead or stand.cell == stand.end]
 
@@ -254,11 +254,8 @@ class Leader:
         """Returns a grant, to a host that sends changes as changes since the one that it has used."""
         used = host.standing.knows if host.changes and host.standing is not None else (0, 0)
         base, _ = self._content.get(used, {}).get(granted.host, (granted, None))
-        return (
-            granted.changes(base)
-            if base.stamp < granted.stamp and base.generation == granted.generation
-            else granted
-        )
+        is_older = base.stamp < granted.stamp and base.generation == granted.generation
+        return granted.changes(base) if is_older else granted
 
     def _content_of(self, table: Table) -> dict[str, tuple[Granted, object]]:
         """Returns host -> its part of the table that has just been made, and what of that is news: not the number

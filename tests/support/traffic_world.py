@@ -236,7 +236,8 @@ class Process:
         pushed = self.rights.host.pushed.get(vehicle, 0)
         if pushed:
             better = len(wants)
-        return Wish(ahead, wants, better, max(self.ages[vehicle], pushed))
+        # In steps, so that a statement of changes leaves out vehicles that wait.
+        return Wish(ahead, wants, better, max(self.ages[vehicle] >> 10 << 10, pushed))
 
 
 class TrafficWorld:

@@ -128,9 +128,10 @@ def test_a_host_says_what_it_has_left_to_those_who_follow_until_a_table_lists_it
 
 
 def test_the_older_of_two_generations_learns_that_it_is_replaced(holdings: Holdings) -> None:
-    table = table_of(1, 1, a0=[9])
+    """Even by changes since a table that only the younger one has used."""
+    table = table_of(1, 2, a0=[9])
     table.hosts["a0"] = (2, 1)
-    hear(holdings, table)
+    holdings.hear_granted(msgspec.structs.replace(granted_of(table), since=(1, 1)), 0)
     assert holdings.replaced
     assert list(holdings.path("a0-00")) == []
     assert all(told.standing.ended for told in holdings.standings({}, S))
