@@ -191,7 +191,7 @@ class RightOfWaySync:
             case traffic.Word(shard=shard):
                 return holdings.is_pending(shard)
             case traffic.HostState(vehicles=stands):
-                return bool(stands)
+                return any(stand.better for stand in stands)
         return False
 
     def hear(self, message: Message, now_ns: int) -> list[str]:

@@ -253,9 +253,8 @@ class Leader:
     def _since_used(self, granted: Granted, host: _Host) -> Granted:
         """Returns a grant, to a host that sends changes as changes since the one that it has used."""
         used = host.standing.knows if host.changes and host.standing is not None else (0, 0)
-        base, _ = self._content.get(used, {}).get(granted.host, (granted, None))
-        is_older = base.stamp < granted.stamp and base.generation == granted.generation
-        return granted.changes(base) if is_older else granted
+        base, _ = self._content.get(used, {}).get(granted.host, (None, None))
+        return granted if base is None or base.generation != granted.generation else granted.changes(base)
 
     def _content_of(self, table: Table) -> dict[str, tuple[Granted, object]]:
         """Returns host -> its part of the table that has just been made, and what of that is news: not the number
