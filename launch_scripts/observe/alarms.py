@@ -137,7 +137,7 @@ class Alarm:
         """For a report."""
         row, col = self.place(grid) or (None, None)
         told = {**asdict(self), "row": row, "col": col}
-        return {name: value for name, value in told.items() if name not in ("began_ns", "is_old")}
+        return {name: value for name, value in told.items() if name != "is_old"}
 
 
 def alarms_of(latest: LatestState, targets: Iterable[str], now_ns: int) -> tuple[Alarm, ...]:

@@ -12,8 +12,7 @@ import io
 import math
 import re
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
-from datetime import datetime
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -45,7 +44,6 @@ from shared_map.array_files import Bools, Bytes, Floats
 from shared_map.learned_factors import keys_of
 from shared_map.terrain.terrain import Level, Terrain, any_in_blocks, level_of
 from shared_map.terrain.zones import zone_mask
-from swarm.clock import NS_PER_S
 from swarm.config.input_files import FileKind, read_bytes, read_text
 from swarm.config.scenario import Scenario
 from swarm.errors import StoreError, TerrainError
@@ -415,9 +413,7 @@ def _alarms(report: Mapping[str, Any]) -> list[tuple[str, bool, list[str]]]:
     """Returns the alarms, the serious first: a line, whether it is serious, and the lines that it summarises."""
     size = report.get("terrain") or {}
     grid = GridSpec(size.get("rows", 1), size.get("cols", 1), 1.0)
-    began = (report.get("made") or {}).get("began")
-    began_ns = None if began is None else round(datetime.fromisoformat(began).timestamp() * NS_PER_S)
-    told = [replace(each, began_ns=began_ns) for each in msgspec.convert(report.get("alarms") or [], list[Alarm])]
+    told = msgspec.convert(report.get("alarms") or [], list[Alarm])
     return [
         (line, serious, parts)
         for serious in (True, False)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import atexit
 import time
 from collections import Counter
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from dataclasses import replace
 from pathlib import Path
@@ -213,10 +213,10 @@ class Swarm:
         return self._session.ended
 
     @property
-    def counts(self) -> Mapping[str, int]:
+    def counts(self) -> Counter[str]:
         """Counters since the connection began: rejected and missed messages, reported problems, and those of the
-        bus."""
-        return {**self._session.bus.counts, **self._session.counts}
+        bus. One that nothing has counted is 0."""
+        return Counter({**self._session.bus.counts, **self._session.counts})
 
     def vehicle(
         self,
