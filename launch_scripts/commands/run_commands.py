@@ -174,8 +174,6 @@ def up(scenario: shared_options.ScenarioArgument, run: RunOptions, meeting: Meet
 
 def _began_s() -> float:
     """Start of this process on the monotonic clock, so that imports count as start-up time."""
-    import psutil
-
     began_s: float = psutil.Process().create_time()
     return time.monotonic() - max(time.time() - began_s, 0.0)
 

@@ -32,6 +32,8 @@ from multiprocessing.context import ForkServerProcess
 from pathlib import Path
 from typing import Any, NamedTuple
 
+import psutil
+
 from launch_scripts.launcher.child_main import ExitReason, run_child
 from launch_scripts.launcher.forkserver import forking
 from launch_scripts.launcher.log_file import LogFormat
@@ -97,8 +99,6 @@ class Stillness:
 
 def sight_of(pid: int | None) -> Sight | None:
     """Returns the main thread of a process as the system shows it; None if there is none."""
-    import psutil  # the launcher needs none to start
-
     with contextlib.suppress(psutil.Error):
         process = psutil.Process(pid or 0)
         used_s = next((each.user_time + each.system_time for each in process.threads() if each.id == pid), 0.0)
@@ -114,8 +114,6 @@ class IdleTime:
 
     def any_until(self, now_s: float) -> bool:
         """Returns True if a processor was idle since the last call."""
-        import psutil
-
         times = psutil.cpu_times()
         idle_s = times.idle + getattr(times, "iowait", 0.0)
         any_idle = idle_s - self._idle_s >= _IDLE_SHARE * (now_s - self._at_s)

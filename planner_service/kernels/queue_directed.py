@@ -6,8 +6,8 @@ Neighbours of a cell are offered different keys, so that a cell's first offer is
 `queue_dial`. But where no cell of a bucket offers anything that lies in it, all of them are final. So a cell
 waits under its own cost, once for each time that it fell, and is served once. Parents follow from the costs.
 
-A cost's *index* is how many finest widths it has. Its digits to the base 128 say where a cell waits: in the bucket
-of the first digit in which its index differs from what is served, so that buckets of one level are 128 times as
+A cost's *index* is how many finest widths it has. A cell waits in the bucket of the
+first digit, to the base 128, in which its index differs from what is served. Buckets of one level are 128 times as
 wide as those of the level below. When the turn of a bucket comes, the least that any of its cells may offer decides
 (A. Crauser, K. Mehlhorn, U. Meyer, P. Sanders, "A parallelization of Dijkstra's shortest path algorithm", MFCS
 1998, their OUT-criterion): cells that cost no more than that are final. They are served, and the others wait on;

@@ -12,8 +12,8 @@ from swarm.config.input_files import FileKind
 from swarm.files import make_folder
 from swarm.journal import Journal
 
-K = TypeVar("K")
-V = TypeVar("V")
+_K = TypeVar("_K")
+_V = TypeVar("_V")
 
 HEARTBEAT_NS = NS_PER_S // 5
 """Period at which an unchanged statement is repeated: by it members know of a leader, and a leader of its hosts."""
@@ -31,7 +31,7 @@ def is_said(says: object, told: object, age_ns: int, again_ns: int = HEARTBEAT_N
     return says == told and 0 <= age_ns < again_ns
 
 
-def keep_last(kept: dict[K, V], key: K, value: V, most: int) -> None:
+def keep_last(kept: dict[_K, _V], key: _K, value: _V, most: int) -> None:
     """Adds a value. The oldest goes if there are more than `most`."""
     kept[key] = value
     if len(kept) > most:

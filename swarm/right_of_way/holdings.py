@@ -94,7 +94,8 @@ class _View:
     stands    vehicle that has a place -> the last statement about it
     told      what was news of the last statement about our vehicles, and its time
     same      whether the next statement is known to be the same
-    sent      seq -> host state, the last ones since the leader's first grant: it has that which it has `heard`
+    sent      seq -> host state, the last ones since the leader's first grant: it has that which it has `heard`.
+              Empty if leaders read no changes of ours
     used      stamp -> grant, the last ones that were acted on
     """
 
@@ -493,10 +494,9 @@ class Holdings:
             ended=self.replaced,
             never=sorted(self._entries.never(shard)),
         )
-        # Of strangers, and where an agent may lie, a leader keeps no earlier statement: they cost it little memory.
-        reads = members == (view.leader,) and self.name in self.shards.agents and not self.shards.proven
-        base = view.sent.get(view.heard) if reads else None
-        keep_last(view.sent, self._seq, standing, STATES_KEPT)
+        base = view.sent.get(view.heard) if members == (view.leader,) else None
+        if self.shards.reads_changes(self.name):
+            keep_last(view.sent, self._seq, standing, STATES_KEPT)
         return Tell(members, standing if base is None else standing.changes(base))
 
     def _listeners(self, shard: int, now_ns: int) -> tuple[str, ...]:

@@ -86,7 +86,7 @@ class _Host:
               request nothing now
     spoke_ns  time of the last message, of any of its generations: a replaced one is informed
     told      the last grant to it, and its time
-    said      (generation, seq) -> statement, the last ones of an agent, unless certificates prove names
+    said      (generation, seq) -> statement, the last ones, if changes of them are read
     changes   whether the newest was sent as changes: then so are grants
     """
 
@@ -201,7 +201,7 @@ class Leader:
         self._changed |= self._orders.by_host_count(host) != before
         self.seq = max(self.seq, self._orders.newest - 1)  # the next table is not older than its entries
         known.standing, known.stands, known.heard_ns = standing, stands, now_ns
-        if host in self._fleets and not self._shards.proven:
+        if self._shards.reads_changes(host):
             keep_last(known.said, (standing.generation, standing.seq), standing, STATES_KEPT)
         known.asking = [stand for stand in stands.values() if stand.ahead or stand.cell == stand.end]
 

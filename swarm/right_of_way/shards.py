@@ -104,6 +104,11 @@ class Shards:
         cols, side = self._cols, self.side
         return self._first + cell // cols // side * self._across + cell % cols // side
 
+    def reads_changes(self, host: str) -> bool:
+        """Returns True if leaders keep the last statements of a host, to read changes since them: not those of
+        strangers, nor where an agent may lie. So these cost them little memory."""
+        return not self.proven and host in self.agents
+
     def has_quorum(self, agents: Collection[str]) -> bool:
         """Returns True if no other layout can have seats, given that these agents use this one.
 

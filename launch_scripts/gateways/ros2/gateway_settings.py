@@ -1,6 +1,6 @@
 """Settings of the gateway to ROS 2: a TOML file, checked as scenarios are; and the table of topics, `topics.toml`.
 
-What is in the table crosses between the swarm and ROS. Nothing else does.
+The table lists what crosses between the swarm and ROS. Nothing else does.
 """
 
 from __future__ import annotations
