@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from planner_service.growth_times import Askers, GrowthTimes, WindowSchedule, exact_half
 from planner_service.kernels.layout import NONE
-from planner_service.kernels.route_kernels import UNREACHABLE
+from planner_service.kernels.route_kernels import UNREACHABLE, box_of
 from planner_service.kernels.stride_networks import StrideNetwork
 from planner_service.strategy import OnMove, Strategy, StrategyRow, whole_trees_only
 from planner_service.tree import partitioned_tree
@@ -572,9 +572,9 @@ class TargetTree:
         """Notes padded cells that asked, and how far a growth must go for them."""
         if not starts.size:
             return
-        rows, cols = np.divmod(starts, self._costs.stride)
         row, col = divmod(self._costs.pad(self._tree.root), self._costs.stride)
-        half = int(max(np.abs(rows - row).max(), np.abs(cols - col).max()))
+        row0, col0, row1, col1 = box_of(starts.astype(np.uint32), self._costs.stride)
+        half = max(row - row0, row1 - 1 - row, col - col0, col1 - 1 - col)
         if (self._is_whole or self._too_far) and self._without_path(starts).size:
             half = self._grid.cells
         self._askers.note(starts, self._grid.around(self._tree.root, half).cells)

@@ -147,12 +147,11 @@ class PartialGrowth:
         between = float(grid.cell_cost[root] + self.cost[root] - grid.cell_cost[self.root])
         most = float(self.cost[askers].max()) + between * grid.dearest_step
         most *= 1.0 + (most / lowest + 8.0) * 2.0**-22  # costs are rounded once for each step
-        rows, cols = np.divmod(askers, grid.stride)
         row, col = divmod(root, grid.stride)
-        row0, row1, col0, col1 = rows.min(), rows.max(), cols.min(), cols.max()
-        if not most <= _AIMED * lowest * max(row0 - row, row - row1, col0 - col, col - col1):
+        row0, col0, row1, col1 = box_of(askers.astype(np.uint32), grid.stride)
+        if not most <= _AIMED * lowest * max(row0 - row, row - (row1 - 1), col0 - col, col - (col1 - 1)):
             return queue_dial.NO_AIM
-        return float(row0), float(col0), float(row1), float(col1), lowest, most
+        return float(row0), float(col0), float(row1 - 1), float(col1 - 1), lowest, most
 
     def go_on(self, askers: Cells, most: int, aim: queue_dial.Aim = queue_dial.NO_AIM) -> int:
         """Grows until these padded, passable cells have a cost, `most` more cells have one, or no cell is left.
