@@ -6,7 +6,6 @@ python -m docs.generate --check    exit code 1 if a file is not what the code sa
 
 from __future__ import annotations
 
-import argparse
 import inspect
 import re
 import sys
@@ -15,7 +14,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import typer
 
@@ -32,18 +31,7 @@ _DOCS = Path(__file__).parents[1]
 _REFERENCE, _DESIGN = _DOCS / "reference", _DOCS / "design"
 _PROGRAM = re.compile(r"(\[`docs/(examples/\w+\.py)`\].*\n\n(?:<!--.*-->\n\n)?```python\n)(?:.*\n)*?(?=```)")
 _MEASUREMENTS = tomllib.loads(Path(__file__).with_name("measurements.toml").read_text(encoding="utf-8"))
-_QOS = {
-    "DEFAULT": "reliable, volatile, last 10",
-    "LATCHED": "reliable, transient local, last 1",
-    "SENSOR": "best effort, volatile, last 5",
-    "TRANSFORMS": "reliable, volatile, last 100",
-}
 _EXAMPLES = re.compile(r"^swarm .*(?:\n+swarm .*)*$", re.MULTILINE)
-_TLS = "`--tls-dir`, `--tls-ca`, `--tls-cert`, `--tls-key`"
-SWARM = f"{_TLS}, `--connect`, `--namespace`, `--run`, `--runs`"
-"""The options by which a command finds the swarm."""
-PROCESS = f"{_TLS}, `SCENARIO`, `--connect`, `--namespace`, `--runs`, `--health-port`, `--signals-address`"
-"""The options of a process which is started by hand."""
 
 
 def command_line() -> str:
@@ -52,7 +40,7 @@ def command_line() -> str:
     times = Counter(row for _, _, rows in commands for row in rows)
     first = {f"{about}{rows}": words for words, about, rows in reversed(commands)}
     shared = sorted(row for row in times if times[row] > 1)
-    return filled("cli", commands=commands, first=first, shared=shared, swarm=SWARM, process=PROCESS)
+    return filled("cli", commands=commands, first=first, shared=shared)
 
 
 def _commands(words: str, group: Any) -> Iterator[tuple[str, Any]]:
@@ -84,7 +72,7 @@ def _rows(command: Any) -> list[tuple[str, str, str]]:
 def ros2() -> str:
     """Returns the page of what `swarm gateway ros2` forwards and of its settings."""
     settings = scenario_page.settings(Settings)
-    return filled("ros2", table=gateway_settings, qos=_QOS, settings=settings)
+    return filled("ros2", table=gateway_settings, settings=settings)
 
 
 def design() -> str:
@@ -117,11 +105,10 @@ PAGES: dict[Path, Callable[[], str]] = {
 """File -> what makes its text, without the line end at its end."""
 
 
-def main() -> int:
-    """Writes or checks the pages; returns the exit code."""
-    parser = argparse.ArgumentParser(prog="docs.generate", description="Write the pages of the reference.")
-    parser.add_argument("--check", action="store_true", help="only tell whether the files are current")
-    check = parser.parse_args().check
+def main(
+    check: Annotated[bool, typer.Option("--check", help="Only tell whether the files are current.")] = False,
+) -> None:
+    """Writes the pages of the reference. With --check, exit code 1 if a file is not what the code says."""
     stale = 0
     for path, make in PAGES.items():
         text = make() + "\n"
@@ -130,8 +117,8 @@ def main() -> int:
         elif not path.is_file() or path.read_text(encoding="utf-8") != text:
             print(f"{path} is not current: run `python -m docs.generate`", file=sys.stderr)
             stale = 1
-    return stale
+    raise typer.Exit(stale)
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    typer.run(main)

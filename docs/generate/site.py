@@ -16,10 +16,7 @@ from mkdocs.structure.files import File
 ROOT = Path(__file__).parents[2]
 PACKAGES = ("planner_service", "shared_map", "swarm", "vehicle_agent")
 _NUMPY = re.compile(r"^ *(Parameters|Returns|Raises)\n *-+$", re.MULTILINE)
-"""What the public API of a package looks like, for readers of NumPy's documentation."""
-_API, _DESIGN = "Python API", "Design"
-
-
+"""A section of a docstring as NumPy's documentation has them."""
 _ROW = re.compile(r"(?P<names>[A-Za-z_][\w.`]*(?:, [A-Za-z_][\w.`]*)*) {2,}(?P<meaning>\S.*)")
 
 
@@ -74,8 +71,8 @@ def on_config(config: Any) -> Any:
     """Puts the generated pages and the design pages where mkdocs.yml names their sections."""
     design = sorted(f"design/{path.name}" for path in (ROOT / "docs" / "design").glob("*.md"))
     inside = {
-        _API: [{package: _api_path(package)} for package in packages()],
-        _DESIGN: sorted(design, key=lambda name: name != "design/index.md"),
+        "Python API": [{package: _api_path(package)} for package in packages()],
+        "Design": sorted(design, key=lambda name: name != "design/index.md"),
     }
     for section in config.nav:
         for entries in section.values():
