@@ -146,7 +146,7 @@ def health(url: Annotated[str, typer.Option()], live: bool = False, as_json: sha
 
     swarm health --url http://127.0.0.1:9464 --live
 
-    url   Where figures or health are served, such as http://127.0.0.1:9464.
+    url   Where metrics or health are served, such as http://127.0.0.1:9464.
     live  Check that processes are alive, not that they are ready.
     """
     from launch_scripts.web.health_probe import ask

@@ -65,7 +65,7 @@ def plan(
     removes archives of other machines.
 
     hosts  The machines, in TOML: see docs/operate/machines.md.
-    out    Write an archive for each machine here, certificates included; if not given, only show.
+    out    Write an archive for each machine here, certificates included; if not given, only print the plan.
     kit    Service manager of the processes: systemd, or compose (containers).
     image  Image of the roles, NAME:TAG, for containers; if not given, that of this version.
     wheel  Put this wheel of the swarm into the archives, to be installed from them.
@@ -222,7 +222,7 @@ def certs(
 
     folder    Folder of the authority and of all certificates.
     names     Names to make certificates for. A router needs the hosts that others connect to.
-    scenario  Also renew its processes' certificates that are missing, expire soon or are revoked.
+    scenario  Also make the certificates of its processes that are missing, expire soon or are revoked.
     days      Days until they expire.
     renew     Replace existing certificates of the names given.
     """
