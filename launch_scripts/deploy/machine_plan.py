@@ -66,8 +66,8 @@ class HostsConfig(Section, frozen=True, kw_only=True):
     """The machines of a swarm.
 
     port     on which every router listens
-    survive  how many machines may be lost for good, at once: there is one more keeper, and as many standbys of
-             planners and of the targets process at least; 1 if not given, 0 where there is one machine
+    survive  how many machines may be lost at the same time: there is one more keeper, and at least as many
+             standbys of planner, places and targets processes; 1 by default, 0 with one machine
     hosts    the machines
     """
 
@@ -304,7 +304,7 @@ def place(
     before: Mapping[str, str],
     launcher_cores: float,
 ) -> dict[str, list[PlannedProcess]]:
-    """Host name -> its processes. Every role has machines enough.
+    """Returns host name -> its processes. There are enough machines for every role.
 
     Each goes to the machine that is then the least loaded for its cores, of those that have none of the same job,
     or of all where there is one. Roles that few machines can carry are placed first, so that others leave them

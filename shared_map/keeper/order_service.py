@@ -151,7 +151,7 @@ class KeptOrders:
         asked.end()
 
     def stale(self, asked: Asked, now_ns: int) -> str | None:
-        """Reason why an order of a person or a zone is none that is given now; None for all other queries."""
+        """Returns why an order was not given just now; None if it was, and for all other queries."""
         match asked.request:
             case (orders.GiveOrder() | orders.ZoneOrder() | orders.SendVehicle()) as order if (
                 order.changes and self._fresh is not None
