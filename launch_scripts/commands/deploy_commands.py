@@ -90,7 +90,7 @@ def plan(
     if kit != "systemd" and wheel is not None:
         raise ConfigError(f"--wheel: found {wheel} with --kit {kit}, expected none: containers have an image")
     if out is None and (image or wheel is not None):
-        raise ConfigError("--image and --wheel go into what --out writes, and it is not given")
+        raise ConfigError("--image and --wheel need --out, whose archives hold them")
     check_start(chosen, joins=True, has_ground=True)
     written = [] if out is None else _write(made, out, kit, image, days, wheel)
     if as_json:
@@ -129,7 +129,7 @@ def _show(made: Plan, kit: KitName) -> None:
     console = Console(highlight=False)
     console.print(table)
     machines = number_of(len(made.hosts), "machine")
-    without = f"survives the loss of any {made.survive} of its {machines}; the vehicles of a lost machine stand"
+    without = f"survives the loss of any {made.survive} of its {machines}; the vehicles of a lost machine stop"
     what = f"the run {without if made.survive else 'needs every machine'}"
     console.print(f"run {made.run_id}: {number_of(len(made.processes), 'process')}; {what}", soft_wrap=True)
     if kit == "systemd":

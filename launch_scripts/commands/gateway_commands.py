@@ -175,7 +175,7 @@ def mavlink(
         option = "--arm" if drives.arm else "--altitude"
         raise ConfigError(f"{option} goes with --target or --to: without one nothing is driven")
     if drives.above == "terrain" and altitude is None:
-        raise ConfigError("--above terrain goes with --altitude: how many metres above it")
+        raise ConfigError("--above terrain needs --altitude: the metres above it")
     network = where.network()
 
     wishes = Wishes(

@@ -289,7 +289,7 @@ def logs(
     found = _chosen(run)
     names = sorted({file.name.partition(".log")[0] for file in _log_files(found.folder)})
     if process is not None and process not in names:
-        has = choice(process, names, " it has ") if names else "; it has none"
+        has = choice(process, names, " it has ") if names else "; it has no logs"
         raise ConfigError(f"run {found.name} has no log of {process!r}{has}")
     width, read = max(map(len, names), default=0), dict[int, int]()
     told: Iterable[_Line] = _new_lines(found.folder, process, read)
