@@ -162,7 +162,7 @@ class TargetTree:
         self._windows = WindowSchedule(grid, config, self.times)
         # Knows the last exact costs and every change since: certificates while the tree is not exact.
         self._bounds = LowerBounds(self._costs)
-        # Growths that stop, and who has asked: how far they go. Some lay farther than a growth may go here.
+        # Growths that stop, and the askers, which decide how far they go. Some were too far for a growth here.
         self._growth = PartialGrowth(self._costs)
         self._askers = Askers()
         self._too_far = False

@@ -359,7 +359,7 @@ class Recorder:
             self.captures.append(Capture(self.seconds(now_ns), note.target, *place_m))
 
     def _sample(self, now_ns: int) -> None:
-        """Samples what is due: places and what vehicles have driven every half second, figures every second."""
+        """Takes the samples that are due: places and driven distances every half second, figures every second."""
         if now_ns >= self._due_ns:
             self._due_ns = now_ns + _TRACK_NS
             self._sample_places(now_ns)

@@ -251,7 +251,7 @@ class KeptOrders:
         return goals
 
     def _fault_of(self, given: orders.SendVehicle, cells: Sequence[int]) -> str | None:
-        """Reason why the vehicle cannot go to these cells. Planners know what is lethal for other classes."""
+        """Reason why the vehicle cannot go to these cells. Only planners know the lethal cells of other classes."""
         if given.then == "repeat" and len(set(cells)) < 2:
             return "to repeat, expected two different places or more"
         if agent_of(given.vehicle) not in self._on_ground:

@@ -193,7 +193,7 @@ _ROWS = 16
 
 
 _LAST = (1 << 62, 0)
-"""In place of what is known of a sender that was forgotten."""
+"""Default for senders that were forgotten."""
 
 
 @dataclass(slots=True)

@@ -99,7 +99,7 @@ def read_scenario(
             taken_out.add(place)
             if not _take_out(raw, place):
                 break
-    if scenario is None or faults:  # what is left names its files, whatever the rest is
+    if scenario is None or faults:  # the valid rest names its files
         return None if scenario is None else anchored(scenario, base or Path()), faults
     scenario = msgspec.convert(complete_costs(raw), Scenario)  # only now, so that a fault of [cost] is one fault
     try:
