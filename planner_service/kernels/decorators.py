@@ -47,7 +47,7 @@ KERNELS: dict[str, Any] = {}
 """Name -> kernel, of all that Python calls, in the order in which modules were imported."""
 
 BEFORE_LOAD: list[Callable[[str], None]] = []
-"""Called with the name of the kernel that is loaded or compiled next, on the thread that waits for it."""
+"""Called with what is loaded or compiled next, on the thread that waits for it."""
 
 
 class _ReadOnlyLocator(caching.UserProvidedCacheLocator):
