@@ -300,7 +300,7 @@ def _sentence(error: TyperException) -> str:
     said: str = error.format_message()
     if wrong:
         said = said.replace(wrong[0]["msg"], f"found {quoted(wrong[0]['input'])}; {wrong[0]['msg']}")
-        said = said.replace("Input should be", "expected")
+        said = re.sub("Value error, |, unable to parse [^;]*", "", said).replace("Input should be", "expected")
     elif param is not None and said.startswith("Missing") and param.help:
         said = f"{said.removesuffix('.')}: {param.help}"
     elif unknown := re.fullmatch(r"No such command '(.*)'\.", said, re.DOTALL):

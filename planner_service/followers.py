@@ -126,7 +126,7 @@ class Followers:
 
     @property
     def cells(self) -> NDArray[np.int64]:
-        """Cells of all followers."""
+        """int64 (followers,): the cell of each follower."""
         return np.fromiter((follower.cell for follower in self._by_id.values()), np.int64, len(self._by_id))
 
     def on_chasers(self, chasers: Chasers, now_ns: int) -> None:
@@ -159,7 +159,7 @@ class Followers:
     def given(
         self, vehicle: str, route: Route, max_cells: int, now_ns: int, push_ns: int, goal: int | None = None
     ) -> None:
-        """A vehicle asked, and this is the answer. A start outside the grid is ignored."""
+        """Notes the route that a request of a vehicle received. A start outside the grid is ignored."""
         if not 0 <= route.start < self._grid.cells:
             return
         follower = self._by_id.get(vehicle)
@@ -253,7 +253,7 @@ class Followers:
         return self._by_id.get(vehicle)
 
     def mark_stale(self, vehicle: str) -> None:
-        """There may be a better route for a vehicle than the one it has."""
+        """Notes that a vehicle's route may not be the best any more."""
         if vehicle in self._by_id:
             self._by_id[vehicle].stale = True
 
@@ -378,13 +378,13 @@ class GapStatistics:
         return float(gaps.max(initial=1.0))
 
     def adopted(self, tree: TargetTree, now_ns: int) -> None:
-        """A worker's tree has replaced the one that was offered until now, and has been compared with it."""
+        """Notes the gaps measured when a worker's tree replaced the one that was offered until now."""
         self._offered(tree.last_gaps)
         self._count_broken(int(np.count_nonzero(tree.last_gaps < 1.0)))
         self._due_ns = now_ns + _EVERY_NS
 
     def record_growth(self, tree: TargetTree, followers: Followers, now_ns: int) -> None:
-        """A tree was grown on this thread: what it offers is read and compared with what it promises."""
+        """Measures the gaps of a tree that was grown on this thread, over the cells of all followers."""
         if now_ns < self._due_ns or not len(followers):
             return
         self._due_ns = now_ns + _EVERY_NS

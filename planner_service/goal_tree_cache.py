@@ -47,7 +47,7 @@ class GoalAnswer(NamedTuple):
 
     @property
     def grows(self) -> bool:
-        """True if it is not known yet."""
+        """True if the route is not known yet: ask again to continue the search."""
         return self.route.status is RouteStatus.NO_TARGET
 
 
@@ -77,7 +77,7 @@ class GoalTrees:
     costs : CostGrid
         Its owner calls `changed` after each `apply`.
     budget_bytes : int
-        What the trees that are kept may take. Beside them one is in hand, with 20 bytes for each cell it has grown.
+        Memory for the kept trees. One more tree is in use, with 20 bytes for each cell that it has grown.
     """
 
     def __init__(self, costs: CostGrid, budget_bytes: int) -> None:
@@ -104,7 +104,7 @@ class GoalTrees:
     # --- changes of the map -------------------------------------------------------------------------------------
 
     def changed(self, changes: Changes) -> None:
-        """The cost map has changed, by `CostGrid.apply`, which returned this."""
+        """Notes changes of the cost map, as `CostGrid.apply` returned them."""
         if not changes.cells.size:
             return
         self._put_down()

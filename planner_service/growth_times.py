@@ -84,7 +84,7 @@ class GrowthTimes:
         """True if a row may come into force by which growths stop: askers are then noted under the others, too."""
         self._full_took_ns: deque[int] = deque(maxlen=_MEDIAN_OF)
         self._exact_took_ns: deque[int] = deque(maxlen=_MEDIAN_OF)
-        # What growths up to askers would take if the window were the map. The first ones make their scratch, too.
+        # Time of a growth up to askers, scaled to the whole map. The first ones include allocation of scratch.
         self._near_whole_ns = grid.cells * MODEL_NEAR_NS_PER_CELL
         self._near_took_ns = deque([self._near_whole_ns] * 2, maxlen=_MEDIAN_OF)
         self._moves_per_tick, self._chosen_at = 1.0, 1.0

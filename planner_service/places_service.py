@@ -139,7 +139,7 @@ class _ClassTrees:
             for id, each in self.followers.all_items()
             if each.goal is not None and not each.stale
         ]
-        copied = np.empty_like(pace)  # of which only what is written becomes memory
+        copied = np.empty_like(pace)  # only written pages take memory
         for window in windows:
             part = np.s_[window.row0 : window.row1, window.col0 : window.col1]
             copied[part] = pace[part]

@@ -55,7 +55,7 @@ class Refusal:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Work:
-    """Run `job` on a worker, and bring what it returns to `Planner.adopt` or `TargetTree.take_strides`."""
+    """Requests a `job` on a worker. Its result goes to `Planner.adopt` or `TargetTree.take_strides`."""
 
     job: Callable[[], GrownTree] | Callable[[], StrideNetwork]
 
@@ -149,7 +149,7 @@ class Planner:
             counters.count(name, 0)
 
     def lead(self, leads: bool) -> None:
-        """Takes over, or leaves the lead to another."""
+        """Begins to lead, or stands by."""
         self.leads = leads
         self.push_all()
 
@@ -160,7 +160,7 @@ class Planner:
             self.followers.forget_routes()
 
     def set_pace(self, cpu_budget: float, push_s: float) -> None:
-        """Sets the share of a core that it may use, and how often it pushes a vehicle newer routes."""
+        """Sets the share of a core that it may use, and the least time (s) between two pushes to a vehicle."""
         self._push_ns = int(push_s * NS_PER_S)
         self.tree.times.set_budget(cpu_budget)
 

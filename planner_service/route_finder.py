@@ -33,7 +33,7 @@ class FoundRoute:
     status         "ok", or "unreachable", "outside", "lethal_start", "lethal_target"
     cells          int64 (steps + 1, 2), row and col of every cell from the start to the target; the start alone
                    where there is no route
-    cost_s         s, what driving it takes; inf where there is no route
+    cost_s         s, the driving time; inf if there is no route
     lower_bound_s  s; no route from there to the target takes less, which is proven
     length_m       m
     """
@@ -128,12 +128,12 @@ class RouteFinder:
         self._update([])
 
     def move(self, target: tuple[int, int]) -> None:
-        """The target is in another cell. Raises OutsideGridError, and changes nothing, outside the grid."""
+        """Moves the target to a cell (row, col). Raises OutsideGridError, and changes nothing, outside the grid."""
         self._target = self.grid.cell(*_whole(target))
         self._update([])
 
     def change(self, pace: Any, row: int = 0, col: int = 0) -> None:
-        """Overwrite paces: `pace` is a (height, width) block, whose upper left cell is (row, col).
+        """Replaces paces: `pace` is a (height, width) block in s/m, whose north-west cell is (row, col).
 
         Raises ValueError, and changes nothing, on a block that leaves the grid or a pace that is not positive.
         """

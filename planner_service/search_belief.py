@@ -126,7 +126,7 @@ def blocks_of(grid: GridSpec, pace_s_per_m: Floats, range_m: float) -> Blocks:
     Parameters
     ----------
     pace_s_per_m : (rows, cols) float32, s/m; inf is lethal
-    range_m : how far a sensor sees a target; a block is as wide, if that makes no more than `MOST_BLOCKS`
+    range_m : m, how far a sensor sees a target; a block is as wide, or wider if there were over `MOST_BLOCKS`
     """
     widest = max(grid.rows, grid.cols)
     side = min(max(round(range_m / grid.resolution_m), 1), widest)
@@ -217,7 +217,7 @@ class Belief:
         return reached
 
     def predict(self, seconds: float) -> None:
-        """Moves the target on for some seconds."""
+        """Moves the belief on by some seconds of terrain time."""
         steps = min(max(math.ceil(seconds / self.step_s), 1), _MOST_STEPS)
         for _ in range(steps):
             self._drive(seconds / steps)
@@ -251,10 +251,10 @@ class Belief:
         self.mass = driven
 
     def seen(self, places_m: Iterable[tuple[float, float]], range_m: float) -> None:
-        """Vehicles look, and the target is not there.
+        """Removes the belief from all that vehicles see, because the target is not there.
 
         places_m  (east, south) from the grid's corner; one that is no number or outside sees nothing
-        range_m   of their sensors
+        range_m   m, range of their sensors
         """
         left = np.ones(self.blocks.shape, np.float32)
         for east_m, south_m in places_m:

@@ -46,7 +46,7 @@ class Update:
                 its parents, window, repair after map changes, window and strides beyond it, forced range
     window      the cells that may have a new cost or parent; empty if none
     cells       how many cells the kernels visited
-    wants_full  please run `full_job` on a worker, and `adopt` what it returns
+    wants_full  the caller is to run `full_job` on a worker, and to `adopt` its result
     repair_ns   CPU time of the repair after map changes that came first, by the tree's stopwatch; excludes moves
                 and growths
     """
@@ -162,7 +162,7 @@ class TargetTree:
         self._windows = WindowSchedule(grid, config, self.times)
         # Knows the last exact costs and every change since: certificates while the tree is not exact.
         self._bounds = LowerBounds(self._costs)
-        # Growths that stop, and who has asked: how far they go. Some lay farther than a growth may go here.
+        # Growths that stop, and the askers, which decide how far they go. Some were too far for a growth here.
         self._growth = PartialGrowth(self._costs)
         self._askers = Askers()
         self._too_far = False
@@ -194,7 +194,7 @@ class TargetTree:
     # --- keeping up ---------------------------------------------------------------------------------------------
 
     def update(self, pace: Floats, target_cell: int, dirty: Sequence[Window], map_version: int) -> Update:
-        """The target moved, the map changed, or both: do this strategy's inline work.
+        """Follows a move of the target, changes of the map, or both, by the strategy's work on this thread.
 
         Parameters
         ----------
@@ -221,12 +221,12 @@ class TargetTree:
 
     @property
     def wants_full(self) -> bool:
-        """Please run `full_job`: an asker is farther away than a growth may go on this thread."""
+        """True if the caller is to run `full_job`: an asker is farther away than a growth may go on this thread."""
         return self._too_far and not self._job_out
 
     @property
     def wants_strides(self) -> bool:
-        """Please run `stride_job` on a worker, and `take_strides` once it has found them."""
+        """True if the caller is to run `stride_job` on a worker, and to pass its result to `take_strides`."""
         return self.strategy.thins_far_cells and self._loaded and not self._seeks_network
 
     def stride_job(self) -> Callable[[], StrideNetwork]:
@@ -236,7 +236,7 @@ class TargetTree:
         return partial(find_strides, self._costs.snapshot())
 
     def take_strides(self, found: StrideNetwork) -> None:
-        """Goes by the network that was found."""
+        """Uses a stride network from now on, as `stride_job` found it."""
         self._network = found
 
     def adopt(

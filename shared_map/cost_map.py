@@ -52,7 +52,7 @@ class CostMap:
     factors         float32 (KEYS,)       learned factor on the prior of each terrain class
     version         grows by one with every `apply` and `learn` that changed the ground
 
-    learning  take in what authors have learned
+    learning  whether `learn` applies what authors have measured
     """
 
     def __init__(self, terrain: Terrain, *, learning: bool = False) -> None:
@@ -170,7 +170,7 @@ class CostMap:
         )
 
     def inflated(self, ground: Floats, window: Window) -> Floats:
-        """The pace in a window, were this the ground: float32 (rows, cols) of the whole grid."""
+        """Returns the pace in a window, float32, s/m, for a ground: float32 (rows, cols) of the whole grid."""
         outer = self.padded(window)
         wide = inflate(ground[outer.row0 : outer.row1, outer.col0 : outer.col1], self._halves)
         row0, col0 = window.row0 - outer.row0, window.col0 - outer.col0
@@ -215,7 +215,7 @@ def cluster(cells: NDArray[np.int64], cols: int) -> list[Window]:
     """Few windows which cover all cells: bounding boxes by tile, merged where they touch; one box if there are very
     many.
 
-    cells  int64 (n,)  flat indices in a grid with `columns` columns
+    cells  int64 (n,)  flat indices in a grid with `cols` columns
     """
     if len(cells) == 0:
         return []

@@ -249,7 +249,7 @@ class GridSpec:
 
 
 _CODES = bytes(range(8))
-"""Every direction code: what is left of a route without these is none."""
+"""All direction codes: any other byte of a route is invalid."""
 
 
 @lru_cache(maxsize=16)

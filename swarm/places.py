@@ -96,7 +96,7 @@ def read_place(given: Given, what: str) -> Place:
     whole = all(_WHOLE.fullmatch(number) for number in (first, second))
     place = Place(given.strip()[:60], kind, float(first), float(second), whole)
     if kind == "latlon" and not _is_degrees(place):
-        raise ConfigError(f"{what} is {_shown(place)}: no latitude (-90 to 90) and longitude (-360 to 360)")
+        raise ConfigError(f"{what} is {_shown(place)}, expected a latitude (-90 to 90) and longitude (-360 to 360)")
     return place
 
 

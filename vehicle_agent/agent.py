@@ -152,8 +152,7 @@ class Agent:
     # --- what operators order ---------------------------------------------------------------------------------
 
     def set_targets(self, targets: Sequence[str], now_ns: int) -> None:
-        """The targets that the vehicles may go for from now on. Vehicles that change their target get one of
-        these."""
+        """Sets the targets that vehicles may chase from now on. A vehicle without one of them gets one."""
         if list(targets) == self.targets:
             return
         self.targets = list(targets)
@@ -241,7 +240,7 @@ class Agent:
             self._wishes.forget(id)
 
     def stand_down(self) -> None:
-        """Another process drives the vehicles now."""
+        """Stops driving for ever, because another process drives the vehicles."""
         for id in list(self.vehicles):
             del self.vehicles[id]
             self._wishes.forget(id)
@@ -345,7 +344,7 @@ class Agent:
     # --- deciding -------------------------------------------------------------------------------------------
 
     def decide(self, now_ns: int) -> list[AgentAction]:
-        """States what each vehicle needs next; returns the requests to planners."""
+        """Decides what each vehicle needs next. Returns the requests to planners."""
         actions: list[AgentAction] = []
         asks: dict[tuple[str, bool], list[tuple[str, int, Reason]]] = {}
         self.blocked_ticks = 0
@@ -525,7 +524,7 @@ class Agent:
         return begun
 
     def routes_ended(self, request: int, now_ns: int) -> None:
-        """No more answers to `AskRoutes` will come."""
+        """Ends an `AskRoutes`, to which no more replies will come."""
         asked = self._route_requests.pop(request, None)
         for id in asked.vehicles if asked is not None else ():
             if id in self.vehicles:

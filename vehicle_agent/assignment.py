@@ -63,7 +63,7 @@ class CostTable:
 
 
 class Assigner(Protocol):
-    """Says which vehicle of an agent goes for which target. A plug-in is made as
+    """Decides which vehicle of an agent chases which target. A plug-in is made as
     `Name(world: AssignmentWorld, options)`.
 
     An assigner with a true attribute `shares_costs` receives the costs of the whole group: its agents publish
@@ -71,8 +71,8 @@ class Assigner(Protocol):
     """
 
     def assign(self, table: CostTable) -> NDArray[np.int64]:
-        """(vehicles,) index of a target that the vehicle has a route to; -1 lets it keep its target, or take the
-        cheapest."""
+        """Returns int64 (vehicles,): the index of a target to which the vehicle has a route; -1 lets it keep its
+        target, or take the cheapest."""
         ...
 
 
@@ -84,7 +84,7 @@ class Spread:
 
 
 class Cheapest:
-    """Each vehicle the target that it reaches first, whatever the others do."""
+    """Gives each vehicle the target that it reaches first, whatever the others do."""
 
     def assign(self, table: CostTable) -> NDArray[np.int64]:
         return np.full(len(table.vehicles), -1, np.int64)

@@ -115,7 +115,7 @@ class AgentService(MemberService):
 
     @property
     def _has_places(self) -> bool:
-        """True if each vehicle has a place or has left. Those that are added enter as there is space."""
+        """True if each vehicle has a place or has left. Added vehicles enter when there is space."""
         host = self._right_of_way.core.host
         if self._parts.spawning is not None:
             return host.informed

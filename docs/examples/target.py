@@ -1,4 +1,4 @@
-"""A tracker: tells for ten seconds where the target fox is."""
+"""A tracker, which publishes for ten seconds where the target fox is."""
 
 import math
 import time

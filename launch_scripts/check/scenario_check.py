@@ -307,7 +307,7 @@ def _near(closed: Bools, place: tuple[int, int]) -> str:
         return ""
     rows, cols = np.divmod(free, closed.shape[1])
     best = int(np.argmin((rows - place[0]) ** 2 + (cols - place[1]) ** 2))
-    return f"; the nearest cell that will do is [{rows[best]}, {cols[best]}]"
+    return f"; the nearest usable cell is [{rows[best]}, {cols[best]}]"
 
 
 # --- `swarm check`: all of it ----------------------------------------------------------------------------------

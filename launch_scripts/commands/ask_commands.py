@@ -68,7 +68,7 @@ def route(
     if preset is not None or crs is not None:
         raise ConfigError("--preset and --crs go with --terrain: planners of a running swarm go by its scenario")
     if (target is None) == (end is None) or start is None:
-        raise ConfigError("give --from, and --target or --to, to ask a swarm; with --terrain --from and --to")
+        raise ConfigError("give --from with --target or --to, or give --terrain with --from and --to")
     place = read_place(start, "--from")
     from launch_scripts.commands import swarm_route
 
@@ -146,7 +146,7 @@ def health(url: Annotated[str, typer.Option()], live: bool = False, as_json: sha
 
     swarm health --url http://127.0.0.1:9464 --live
 
-    url   Where figures or health are served, such as http://127.0.0.1:9464.
+    url   Where metrics or health are served, such as http://127.0.0.1:9464.
     live  Check that processes are alive, not that they are ready.
     """
     from launch_scripts.web.health_probe import ask

@@ -65,7 +65,7 @@ def plan(
     removes archives of other machines.
 
     hosts  The machines, in TOML: see docs/operate/machines.md.
-    out    Write an archive for each machine here, certificates included; if not given, only show.
+    out    Write an archive for each machine here, certificates included; if not given, only print the plan.
     kit    Service manager of the processes: systemd, or compose (containers).
     image  Image of the roles, NAME:TAG, for containers; if not given, that of this version.
     wheel  Put this wheel of the swarm into the archives, to be installed from them.
@@ -90,7 +90,7 @@ def plan(
     if kit != "systemd" and wheel is not None:
         raise ConfigError(f"--wheel: found {wheel} with --kit {kit}, expected none: containers have an image")
     if out is None and (image or wheel is not None):
-        raise ConfigError("--image and --wheel go into what --out writes, and it is not given")
+        raise ConfigError("--image and --wheel need --out, whose archives hold them")
     check_start(chosen, joins=True, has_ground=True)
     written = [] if out is None else _write(made, out, kit, image, days, wheel)
     if as_json:
@@ -129,7 +129,7 @@ def _show(made: Plan, kit: KitName) -> None:
     console = Console(highlight=False)
     console.print(table)
     machines = number_of(len(made.hosts), "machine")
-    without = f"survives the loss of any {made.survive} of its {machines}; the vehicles of a lost machine stand"
+    without = f"survives the loss of any {made.survive} of its {machines}; the vehicles of a lost machine stop"
     what = f"the run {without if made.survive else 'needs every machine'}"
     console.print(f"run {made.run_id}: {number_of(len(made.processes), 'process')}; {what}", soft_wrap=True)
     if kit == "systemd":
@@ -222,7 +222,7 @@ def certs(
 
     folder    Folder of the authority and of all certificates.
     names     Names to make certificates for. A router needs the hosts that others connect to.
-    scenario  Also renew its processes' certificates that are missing, expire soon or are revoked.
+    scenario  Also make the certificates of its processes that are missing, expire soon or are revoked.
     days      Days until they expire.
     renew     Replace existing certificates of the names given.
     """

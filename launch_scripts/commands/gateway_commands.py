@@ -100,7 +100,7 @@ class Drives:
     target         Follow routes to this target; without it and without --to, others only avoid the vehicle.
     to             Go to this place, as 46.81,9.84, xy:X,Y or cell:ROW,COL.
     drive          By missions, or by guided setpoints.
-    arm            Arm it and set its mode; without it that is the pilot's.
+    arm            Arm it and set its mode. Default: the pilot does both.
     altitude       Altitude (m) of a flying vehicle.
     above          Reference of --altitude; terrain: ArduPilot only.
     vehicle_class  Its vehicle class.
@@ -175,7 +175,7 @@ def mavlink(
         option = "--arm" if drives.arm else "--altitude"
         raise ConfigError(f"{option} goes with --target or --to: without one nothing is driven")
     if drives.above == "terrain" and altitude is None:
-        raise ConfigError("--above terrain goes with --altitude: how many metres above it")
+        raise ConfigError("--above terrain needs --altitude: the metres above it")
     network = where.network()
 
     wishes = Wishes(

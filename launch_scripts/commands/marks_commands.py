@@ -119,7 +119,7 @@ def export(store: Store, out: Path, force: Force = False) -> None:
 
     swarm marks export runs/LAST/map.sqlite marks.gpkg
 
-    out  .json: every set; .tif, .gpkg, .geojson, .kml, .csv: the winners.
+    out  .json: all marks; .tif, .gpkg, .geojson, .kml, .csv: the winning marks.
     """
     terrain, grid, sets = _read(store)
     check_target(out, "OUT", ".json", *TIFF, *AREAS, force=force)

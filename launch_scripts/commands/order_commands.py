@@ -95,13 +95,13 @@ def set_(
 
 @command(app)
 def unset(key: Key, where: Where, as_json: AsJson = False) -> int:
-    """Restore a setting, or the targets of a group, to that of the scenario.
+    """Restore a setting, or the targets of a group, from the scenario.
 
     swarm order unset time_scale
 
     swarm order unset groups.red
 
-    key  A setting, or groups. and the name of a group.
+    key  A setting, or groups.NAME for the targets of a group.
     """
     section, _, name = key.partition(".")
     if section == "groups":

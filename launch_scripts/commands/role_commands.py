@@ -38,7 +38,7 @@ class Part(shared_options.Tls):
         str,
         typer.Argument(
             metavar="SCENARIO",
-            help="For roles, the same for all of a run: a .toml file or a built-in name.",
+            help="A .toml file or a built-in name; the same for all roles of a run.",
             autocompletion=complete_scenarios,
         ),
     ] = "jacksboro"
@@ -55,10 +55,10 @@ class Part(shared_options.Tls):
 class Own:
     """Name of the process among those of its role, and options which only some roles have (`Role.options`).
 
-    id          An agent, such as a0; a router or keeper is 0 unless there are several.
+    id          Of an agent: its id, such as a0. Of a router or keeper: 0, unless there are several.
     target      Of a planner: the target whose tree it keeps, such as t0.
     group       Of places: the group whose vehicles ask, as the scenario names it.
-    rank        Of planner, places, targets: 0 is the leader; 1 takes over when it fails; and so on (`standbys`).
+    rank        Of planner, places, targets: 0 leads, 1 takes over if it fails, and so on (`standbys`).
     listen      Of a router: the endpoint to listen at, such as tls/0.0.0.0:7447.
     store_path  Of a keeper: the SQLite file of marks; if not given, RUNS/RUN_ID/map.sqlite.
     rebuild     Of a keeper: move a damaged store aside and fill a new one from the swarm.

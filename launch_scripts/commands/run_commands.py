@@ -45,14 +45,13 @@ app = typer.Typer()
 class RunOptions:
     """Start and display of a run: `swarm demo` and `swarm up`.
 
-    seconds        How long the run lasts once the swarm is up.
+    seconds        Duration of the run once the swarm is up.
     seed           Seed of everything random.
     no_live        Serve no live view. The run is recorded all the same.
     record_inputs  Record all input of every process, so that `swarm runs replay` can repeat the run.
     metrics_port   Serve metrics to Prometheus, and health to probes, on this port; 0 picks one.
-    plain          Plain lines instead of the live table.
-    detach         Run in the background: return once all processes run and a route was served. `swarm down` ends
-                   it.
+    plain          Print plain lines instead of the live table.
+    detach         Run in the background; return once all processes run and a route was served.
     """
 
     panel: ClassVar[str | None] = None
@@ -89,10 +88,10 @@ class SomeProcesses:
     """Part of a swarm that a launcher starts, and its run.
 
     only       Start only this role or process: planner, planner.t0.r1; may be given several times.
-    rank       Start planners and targets processes of this rank only; 0 is the leader, 1 the first standby.
-    run_id     Take part in this run. By default a new one; of some processes, that of --connect, else one named
-               after the scenario, which later starts continue.
-    take_over  Take over from the launcher that runs this part here, as for an upgrade.
+    rank       Start planner, places and targets processes of this rank only; 0 leads, 1 is the first standby.
+    run_id     Run to take part in. Default: a new run; with --only, the run at --connect, or one named after the
+               scenario, which later starts continue.
+    take_over  Replace the launcher that runs this part on this machine, as for an upgrade.
     """
 
     panel: ClassVar[str | None] = PART
@@ -290,7 +289,7 @@ def logs(
     found = _chosen(run)
     names = sorted({file.name.partition(".log")[0] for file in _log_files(found.folder)})
     if process is not None and process not in names:
-        has = choice(process, names, " it has ") if names else "; it has none"
+        has = choice(process, names, " it has ") if names else "; it has no logs"
         raise ConfigError(f"run {found.name} has no log of {process!r}{has}")
     width, read = max(map(len, names), default=0), dict[int, int]()
     told: Iterable[_Line] = _new_lines(found.folder, process, read)

@@ -132,7 +132,7 @@ class Where(Tls):
     connect    The router's endpoint, such as tls/HOST:7447; by default that of the run.
     namespace  Prefix of all keys: runs in different ones do not meet.
     run        The run to ask, if several run here: its name, or its folder.
-    runs       To find a swarm: only the runs in this folder; if not given, all of yours here.
+    runs       Find the swarm among the runs in this folder. Default: among all of yours here.
     """
 
     panel: ClassVar[str | None] = NETWORK

@@ -53,8 +53,8 @@ def simulate(
 
     swarm simulate jacksboro --seed 7 --seconds 60 --trace events.log
 
-    With --seeds, processes crash and hang, links are cut, clocks are set, messages are lost, late and repeated.
-    Without a name each seed takes the next of the small worlds. Exit code 1 if a law broke in any seed, such as by
+    With --seeds, processes crash and hang, links are cut, clocks jump, messages are lost, late and repeated.
+    Without a name each seed takes the next of the small worlds. Exit code 1 if an invariant broke in any seed: by
     a collision, a lost mark or a vehicle without a route.
 
     swarm simulate --seeds 0:100
@@ -197,7 +197,7 @@ def run(
     """Run a study: scenarios x settings x seeds, on many processes or machines.
 
     Results are kept as they come: a second start, also with other seeds or settings, runs only the missing trials.
-    Exit code 1 if a law broke in any trial, or if a trial has no result. It needs the extra "sweep".
+    Exit code 1 if an invariant broke in any trial, or if a trial has no result. It needs the extra "sweep".
 
     swarm study run study.toml
 

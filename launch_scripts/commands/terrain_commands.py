@@ -61,7 +61,7 @@ def info(
     Reads .tif, .tiff, .img, .hgt, .bil, .flt, .dem, or one of these in a .zip; .dt2, .nc, .vrt, .asc, .grd, .npz,
     .csv and .xyz grids, land cover (ESA WorldCover, CORINE, NLCD), MovingAI .map, ROS map_server .yaml or .yml, and
     .png with --resolution-m and --height-scale. Lines after the table state processing steps and notes; those with
-    a ! look wrong.
+    a ! report possible mistakes.
 
     swarm terrain info srtm.hgt
     swarm terrain info dem.tif --resolution-m 20 --fill

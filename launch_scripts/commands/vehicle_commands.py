@@ -145,14 +145,14 @@ def remove(names: list[str], where: Where, as_json: AsJson = False) -> int:
 
 @command(app)
 def forget(name: str, where: Where) -> None:
-    """Release the cells of vehicles of a dead process. Use only if they are gone.
+    """Release the cells of vehicles of a dead process. Use only if no vehicle is there.
 
     Only a person can know that: a robot whose program has died is still in its cell. Never use it for such a robot.
     Between machines the command needs the external vehicle's own certificate.
 
     swarm order vehicle forget extra
 
-    name  The external vehicle, such as extra or rover7.
+    name  The dead process: an added agent, such as extra, or an external vehicle, such as rover7.
     """
     with where.operators_bus() as (bus, found):
         run = found[0]

@@ -54,15 +54,15 @@ def add(
 
     swarm order zone add --file quarry.geojson --name quarry --class truck
 
-    Each area of a file becomes a zone: quarry, or quarry-1, quarry-2 ... of several. A fence file states which
-    areas to keep in. For other files, --kind keep-in closes everything outside the areas.
+    Each area of a file becomes a zone: quarry, or quarry-1, quarry-2 ... if there are several. A fence file states
+    which areas to keep in. For other files, --kind keep-in closes everything outside the areas.
 
     polygon        Corners as 'LAT,LON LAT,LON ...', or xy:X,Y, or cell:ROW,COL from the north-west.
     file           A file of areas instead, as in a scenario's zones, in any coordinate system.
     layer          Layer of a file that has several.
     crs            Coordinate system, if the file names none, such as EPSG:32632, or local.
     kind           lethal, keep-in (all else is lethal), or pace:X for X seconds per metre.
-    for_           Such as 10min; until removed, if not given.
+    for_           Duration, such as 10min. Default: until removed.
     name           Zone name. Replaces a zone of the same name.
     vehicle_class  Vehicle class; if not given, all vehicles.
     """

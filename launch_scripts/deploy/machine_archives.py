@@ -164,7 +164,7 @@ def _contained(scenario: Scenario, plan: Plan, host: PlannedHost, revoked: Seque
 
 
 def dns_label(text: str) -> str:
-    """A label of DNS (RFC 1123) for a text, another one for every other text."""
+    """Returns a DNS label (RFC 1123) for a text, different for each text."""
     if _LABEL.fullmatch(text) and len(label := text.replace(".", "--")) <= _LONGEST_LABEL:
         return label
     number = hashlib.blake2b(text.encode(), digest_size=4).hexdigest()

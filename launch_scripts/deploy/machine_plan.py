@@ -33,7 +33,7 @@ from swarm.peers import HIGHEST_RANK, job_of
 HostName = Annotated[
     str,
     Meta(
-        pattern=r"^[a-z0-9]([a-z0-9-]{0,30}[a-z0-9])?\Z", description="of 32 small letters, digits and '-' at most"
+        pattern=r"^[a-z0-9]([a-z0-9-]{0,30}[a-z0-9])?\Z", description="of at most 32 small letters, digits and '-'"
     ),
 ]
 """A label of DNS, so that it can be part of a host's name, a unit's and a certificate's."""
@@ -66,8 +66,8 @@ class HostsConfig(Section, frozen=True, kw_only=True):
     """The machines of a swarm.
 
     port     on which every router listens
-    survive  how many machines may be lost for good, at once: there is one more keeper, and as many standbys of
-             planners and of the targets process at least; 1 if not given, 0 where there is one machine
+    survive  how many machines may be lost at the same time: there is one more keeper, and at least as many
+             standbys of planner, places and targets processes; 1 by default, 0 with one machine
     hosts    the machines
     """
 
@@ -108,7 +108,7 @@ def _faults(config: HostsConfig) -> Iterator[str]:
             yield f"{where}: found {host.address!r}, expected a name or an address under which others reach it"
         check_endpoint(host.endpoint(config.port), True, where)
         if len(config.hosts) > 1 and is_loopback(host.address):
-            yield f"{where}: found {host.address!r}, which to each machine is itself; expected one for all"
+            yield f"{where}: found {host.address!r}, by which each machine reaches itself; expected another"
         if len(set(host.roles)) < len(host.roles):
             yield f"hosts[{n}].roles: found a role twice, expected each once"
 
@@ -253,7 +253,7 @@ def _check(scenario: Scenario, hosts: HostsConfig) -> None:
     """Raises ConfigError where too few machines carry a role."""
     alone = len(hosts.hosts) == 1
     if alone and hosts.losses:
-        raise ConfigError(f"survive: found {hosts.losses} with one machine, expected 0 or more machines")
+        raise ConfigError(f"survive: found {hosts.losses} with one machine, expected 0, or several machines")
     for role, of in process_table.TABLE.items():
         if of.expendable or not process_table.jobs_of(scenario, role):
             continue
@@ -262,11 +262,9 @@ def _check(scenario: Scenario, hosts: HostsConfig) -> None:
         # One machine carries a scenario's standbys, too: they cover for a process that hangs.
         found, wanted = sum(role in host.roles for host in hosts.hosts), 1 if alone else more + 1
         if found < wanted:
-            why = f"survive = {more}" if role == KEEPER else f"each process of it has {more} standbys"
-            because = f", because {why}: no two share a machine" if wanted > 1 else ""
-            raise ConfigError(
-                f"hosts: {role!r} is among the roles of {found} machines, expected at least {wanted}{because}"
-            )
+            why = f"survive = {more}" if role == KEEPER else f"each {role} process has {more} standbys"
+            because = f": {why}, and no two share a machine" if wanted > 1 else ""
+            raise ConfigError(f"hosts: {found} machines have the role {role!r}, expected {wanted} or more{because}")
 
 
 def cores_of(scenario: Scenario) -> dict[str, float]:
@@ -304,7 +302,7 @@ def place(
     before: Mapping[str, str],
     launcher_cores: float,
 ) -> dict[str, list[PlannedProcess]]:
-    """Host name -> its processes. Every role has machines enough.
+    """Returns host name -> its processes. There are enough machines for every role.
 
     Each goes to the machine that is then the least loaded for its cores, of those that have none of the same job,
     or of all where there is one. Roles that few machines can carry are placed first, so that others leave them

@@ -55,7 +55,7 @@ _RUNS = Path(__file__).with_name("measured_runs.toml")
 
 
 class Swarm(msgspec.Struct, frozen=True, kw_only=True):
-    """The size of a swarm; `side` is that of its square map in cells, `tick_hz` that of agents and planners."""
+    """Size of a swarm: `side` of its square map (cells), `tick_hz` of agents and planners (ticks a second)."""
 
     vehicles: int
     targets: int

@@ -159,7 +159,7 @@ class Terminal:
 
 
 def _counts(value: Any) -> bool:
-    """Returns True of what was measured and is not zero, of a table if any part of it is so."""
+    """Returns True if a value was measured and is not zero; for a table, if any of its values is so."""
     return any(map(_counts, value.values())) if isinstance(value, dict) else bool(value)
 
 

@@ -21,7 +21,7 @@ from launch_scripts.process_table import TABLE
 _AT_RUN_TIME = ("encodings.idna", "numpy.ma", "psutil")
 """Modules which roles import at run time, each for itself otherwise."""
 
-# What rerun writes goes to log files: without colours, and without its warning of how we write recordings.
+# The output of rerun goes to log files: no colours, and no warning of how we write recordings.
 os.environ.update(NO_COLOR="1", RUST_LOG=os.environ.get("RUST_LOG", "warn,re_log_encoding=error"))
 loads = os.environ.pop(LOADS, "")
 if loads:

@@ -184,7 +184,7 @@ def make_run_dir(runs: Path, run_id: str) -> Path:
     be made."""
     process_table.check_name("run id", run_id)
     if run_id in (".", "..", LAST):
-        raise ConfigError(f"run id {run_id!r} means another folder of {runs}; choose another")
+        raise ConfigError(f"run id {run_id!r} would name another folder than a new one in {runs}; choose another")
     run_dir = runs / run_id
     try:
         make_folder(run_dir)
@@ -315,6 +315,6 @@ def chosen_processes(
             every = [process_table.ProcessSpec(role, id)]
         chosen |= {spec.name: spec for spec in every}
     if not chosen:
-        of_rank = "" if rank is None else f" of rank {rank}"
-        raise ConfigError(f"scenario {scenario.name} has no {' or '.join(words)}{of_rank} to start; see standbys")
+        end = "to start here" if rank is None else f"of rank {rank} to start; see standbys"
+        raise ConfigError(f"scenario {scenario.name} has no {' or '.join(words)} {end}")
     return tuple(sorted(chosen.values(), key=lambda spec: process_table.ROLES.index(spec.role)))

@@ -120,7 +120,7 @@ class Looks:
         else:
             who = [Look("ball", self._hue[name], f"of {name[:14]}") for name in self.groups[:_GROUPS]]
         alike: dict[Colour, list[str]] = {}
-        for state in [*SHADES][1:]:  # who is following has the hue itself
+        for state in [*SHADES][1:]:  # a vehicle that is following has the hue itself
             alike.setdefault(shaded(first, state), []).append(state.name.lower())
         states = [Look("ball", colour, ", ".join(names)) for colour, names in alike.items()]
         return [

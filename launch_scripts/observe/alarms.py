@@ -70,7 +70,7 @@ class Alarm:
     over_s      time of the run at which it was over; None while it lasts
     heard_s     time of the run of its last evidence
     began_ns    time when the run began, from which these count; None if it is not known
-    is_old      whether the last evidence is from long before the observer looks
+    is_old      whether the last evidence was over 30 s old when the observer looked
     """
 
     kind: str

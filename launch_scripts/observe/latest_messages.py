@@ -78,12 +78,12 @@ class RunPlan:
 
 
 def plan_of(scenario: Scenario, started_ns: int | None = None) -> RunPlan:
-    """By the scenario."""
+    """Returns the plan of a scenario."""
     return RunPlan(tuple(scenario.target_ids), tuple(crew_of(scenario)), scenario.vehicle_count, started_ns)
 
 
 def run_of_most(found: Iterable[RunInfo]) -> tuple[str, str]:
-    """(run id, terrain) that most answers name; empty texts where only routers answer, which belong to no run."""
+    """Returns (run id, terrain digest) of most replies; empty texts if only routers reply, which have no run."""
     runs = Counter((info.run_id, info.terrain) for info in found if info.run_id)
     return runs.most_common(1)[0][0] if runs else ("", "")
 
@@ -121,13 +121,13 @@ class VehicleColumns:
         return len(self.ids)
 
     def chasing(self, target: str) -> NDArray[np.intp]:
-        """Returns which of them go for a target."""
+        """Returns the indices of the vehicles that chase a target."""
         if target not in self.target_ids:
             return np.empty(0, np.intp)
         return np.flatnonzero(self.targets == self.target_ids.index(target))
 
     def only(self, kept: NDArray[np.bool_]) -> VehicleColumns:
-        """Some of them."""
+        """Returns a part of the vehicles; kept: bool (n,)."""
         ids = [self.ids[n] for n in np.flatnonzero(kept).tolist()]
         return VehicleColumns(
             ids, self.east_m[kept], self.south_m[kept], self.states[kept], self.targets[kept], self.target_ids
@@ -274,7 +274,7 @@ class LatestState(Counts):
         self._started.setdefault((peer.role, peer.id), set()).add(peer.incarnation)
 
     def alive(self, peer: Peer, up: bool, now_ns: int) -> None:
-        """A liveliness token rose or fell."""
+        """Notes that a liveliness token appeared (`up`) or ended."""
         self.touch(now_ns)
         key = (peer.role, peer.id)
         if peer.incarnation not in self._started.get(key, (peer.incarnation,)):
@@ -291,7 +291,7 @@ class LatestState(Counts):
                 self._told_ns.pop(key, None)
 
     def touch(self, now_ns: int) -> None:
-        """Something of the run came at a time, or its end."""
+        """Notes the time of a message of the run, or of its end."""
         self.first_ns = now_ns if self.first_ns is None else self.first_ns
         self.last_ns = now_ns if self.last_ns is None else max(now_ns, self.last_ns)
 
@@ -401,8 +401,8 @@ class LatestState(Counts):
         return self._vehicles
 
     def driven(self, crew: Collection[tuple[str, str]], now_ns: int) -> VehicleColumns:
-        """Returns the vehicles that are driven: not those that have left, or whose agent has ended. An agent of the
-        crew which ended because it was asked to has said its last words, and they stand."""
+        """Returns the vehicles that are driven: not those that have left, or whose agent has ended. The last report
+        of an agent of the crew which ended on request stays valid."""
         vehicles = self.vehicles()
         agents = list(map(agent_of, vehicles.ids))
         drives = {agent: self._drives(agent, ("agent", agent) in crew, now_ns) for agent in set(agents)}
@@ -439,11 +439,11 @@ class LatestState(Counts):
         return {id: fleet.vehicle_class for fleet in self._fleets.values() for id in fleet.ids}
 
     def targets(self) -> dict[str, tuple[float, float]]:
-        """(east, south) in metres of every target, in order of id."""
+        """Target -> (east, south) in metres from the grid's north-west corner, in order of id."""
         return {id: self.place_m(pose) for id, pose in sorted(self.poses.items())}
 
     def place_m(self, pose: TargetPose) -> tuple[float, float]:
-        """(east, south) from the north-west corner of the grid."""
+        """Returns (east, south) of a pose, in metres from the north-west corner of the grid."""
         return pose.x_m - self.grid.west_m, self.grid.north_m - pose.y_m
 
     def learned_words(self) -> list[MarkSet]:

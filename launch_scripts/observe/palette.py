@@ -49,7 +49,7 @@ def rgb(colour: str) -> tuple[int, int, int]:
 
 
 def hillshade(elevation_m: NDArray[np.float32], resolution_m: float) -> NDArray[np.float32]:
-    """Light of a low sun in the north-west on each cell, 0 to 1; 0.7 in voids."""
+    """Returns the light of a low sun in the north-west on each cell: float32 (rows, cols), 0 to 1; 0.7 in voids."""
     if min(elevation_m.shape) < 2:
         return np.full(elevation_m.shape, 0.7, np.float32)
     south, east = np.gradient(elevation_m.astype(np.float64), resolution_m)
@@ -91,7 +91,7 @@ _MOST_CELLS = 1 << 18
 
 
 def said_length(length_m: float) -> str:
-    """In the unit that people use."""
+    """Returns a length in words, in m or km."""
     return f"{length_m / 1000:g} km" if length_m >= 1000 else f"{length_m:g} m"
 
 

@@ -118,7 +118,7 @@ def rows_over_time(samples: Sequence[Sample]) -> Iterator[dict[str, float | None
 
 
 class BegunRoute(NamedTuple):
-    """A route, and when its vehicle began it."""
+    """A route, and the time at which its vehicle began it."""
 
     time_ns: int
     route: Followed
@@ -348,7 +348,7 @@ class Recorder:
         return state_of(self.observed, now_ns)
 
     def seconds(self, now_ns: int) -> float:
-        """Time of the run."""
+        """Returns the time since the start of the run (s)."""
         return 0.0 if self.observed.began_ns is None else (now_ns - self.observed.began_ns) / NS_PER_S
 
     def _capture(self, note: Note, now_ns: int) -> None:
@@ -359,7 +359,7 @@ class Recorder:
             self.captures.append(Capture(self.seconds(now_ns), note.target, *place_m))
 
     def _sample(self, now_ns: int) -> None:
-        """Samples what is due: places and what vehicles have driven every half second, figures every second."""
+        """Takes the samples that are due: places and driven distances every half second, figures every second."""
         if now_ns >= self._due_ns:
             self._due_ns = now_ns + _TRACK_NS
             self._sample_places(now_ns)

@@ -156,9 +156,9 @@ def _faults(study: Study, seeds: int) -> Iterator[str]:
         if name in SMALL_WORLDS and settled:
             yield f"scenarios: {name!r} is a small world, which takes no parameters and no variants"
     if "seed" in settled:
-        yield "seed: it is no setting of a study, whose `seeds` are those of each case"
+        yield "seed: it is no setting of a study; `seeds` has the seeds of each case"
     if "seconds" in settled and (study.faults or study.seconds is not None):
-        yield "seconds: it does nothing where `faults` or `seconds` of the study say how long trials are"
+        yield "seconds: it has no effect beside `faults` or `seconds` of the study, which set the length of trials"
 
 
 def combinations(study: Study) -> Iterator[tuple[str, str, str, dict[str, Any]]]:

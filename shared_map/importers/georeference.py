@@ -39,7 +39,7 @@ _LIKE_WGS84 = (4326, 4258, 4269)
 _EARTH_M = 6_371_000.0
 """Mean radius of the Earth: a radius within a hundredth of it is that of an ellipsoid of the Earth."""
 METRES = 'LOCAL_CS["image",UNIT["metre",1]]'
-"""Coordinate system of what has no place on Earth."""
+"""Coordinate system of a terrain without a place on Earth."""
 HIGHEST_DEG = 85.0
 """Degrees nearer to a pole than this are not put on metres."""
 

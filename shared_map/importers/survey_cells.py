@@ -92,7 +92,7 @@ class _Resampling:
 
 
 def surveyed(elevation_m: Floats) -> tuple[Floats, NDArray[np.intp], NDArray[np.intp]]:
-    """Returns (heights of the survey's cells, the row of it that each row lies in, the same of columns).
+    """Returns the heights of the survey's cells (m), and the surveyed row of each row and column of each column.
 
     Parameters
     ----------

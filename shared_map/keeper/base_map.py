@@ -129,13 +129,13 @@ class BaseMapServer:
         bus.serve(BASE_TILES, self.answer_tiles, keeper=self._keeper)
 
     def answer_map(self, event: Event) -> None:
-        """Answers what the terrain is."""
+        """Replies with the description of the terrain."""
         assert isinstance(event, Asked)
         event.answer(self._described)
         event.end()
 
     def answer_tiles(self, event: Event) -> None:
-        """Answers with the pieces that are asked for, or says why there are none."""
+        """Replies with the requested pieces, or refuses with the reason."""
         assert isinstance(event, Asked)
         request = event.request
         assert isinstance(request, BaseMapRequest)
@@ -307,7 +307,7 @@ def fetch_base_map(
 
     terrain   digest of the run's terrain
     why       the missing part, to begin the sentence with when it fails: "there is no file ..."
-    within_s  gives up when so long nothing has come
+    within_s  gives up when nothing has arrived for this time (s)
 
     Raises TerrainError if no keeper serves it, or if it is another terrain.
     """

@@ -47,7 +47,7 @@ class CompactionPlan:
         self._expiries_ns: dict[int, int] = {}  # tile -> when the next statement of a dead author can be dropped
 
     def note_alive(self, author: str, now_ns: int) -> None:
-        """An author lives."""
+        """Notes that an author is alive at a time."""
         if author in self._heard_ns or len(self._heard_ns) < _MOST_AUTHORS:
             self._heard_ns[author] = now_ns
 
@@ -82,7 +82,7 @@ class CompactionPlan:
         return tiles
 
     def put_off(self, tiles: Iterable[int]) -> None:
-        """These tiles could not be compacted: they are due again."""
+        """Makes tiles due again that could not be compacted."""
         self._due.update(dict.fromkeys(tiles))
 
     def compacted(self, tile: int, left: Iterable[MarkSet], now_ns: int) -> None:

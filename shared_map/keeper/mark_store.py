@@ -55,7 +55,7 @@ class KeeperStore(SealedDatabase):
         super().__init__(path, (_SETS, _FOLDED, _ORDERS, _SIGHTINGS), rebuild=rebuild, read_only=read_only)
 
     def bind(self, terrain: str, grid: GridSpec, classes: Sequence[str] = ()) -> None:
-        """Tie the store to this terrain, and to these classes. Raises StoreError if it holds the marks of another
+        """Ties the store to this terrain, and to these classes. Raises StoreError if it holds the marks of another
         terrain, or marks for one class alone by whose number another is meant.
 
         classes  those of the scenario beside "ground", in the order of their numbers
@@ -173,7 +173,7 @@ class KeeperStore(SealedDatabase):
             self._put(_SETS, _row(compacted), newer=_NUMBER)
 
     def save_sightings(self, seen: Iterable[Sighted]) -> None:
-        """Keeps where each target was seen last."""
+        """Commits the last sighting of each target."""
         with self._writing():
             rows = [(each.target, each.stamp_ns, encode(each)) for each in seen]
             self._put(_SIGHTINGS, *rows, newer=("stamp_ns",))
@@ -250,11 +250,11 @@ class Keeper:
         self._waiting: dict[tuple[int, str], MarkSet] = {}  # (tile, author) -> newest set not on the disk
 
     def restored(self, mark_set: MarkSet) -> None:
-        """A set was read from the store."""
+        """Notes a set that was read from the store."""
         self.committed.record(mark_set.author, mark_set.tile, mark_set.epoch, mark_set.seq)
 
     def accept(self, mark_set: MarkSet) -> None:
-        """The replica took in a set: it replaces an older one of its tile and author which still waits."""
+        """Queues a set that the replica has merged, instead of an older one of its tile and author."""
         self._waiting[mark_set.tile, mark_set.author] = mark_set
 
     @property

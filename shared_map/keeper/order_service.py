@@ -151,7 +151,7 @@ class KeptOrders:
         asked.end()
 
     def stale(self, asked: Asked, now_ns: int) -> str | None:
-        """Reason why an order of a person or a zone is none that is given now; None for all other queries."""
+        """Returns why an order was not given just now; None if it was, and for all other queries."""
         match asked.request:
             case (orders.GiveOrder() | orders.ZoneOrder() | orders.SendVehicle()) as order if (
                 order.changes and self._fresh is not None
@@ -251,7 +251,7 @@ class KeptOrders:
         return goals
 
     def _fault_of(self, given: orders.SendVehicle, cells: Sequence[int]) -> str | None:
-        """Reason why the vehicle cannot go to these cells. Planners know what is lethal for other classes."""
+        """Reason why the vehicle cannot go to these cells. Only planners know the lethal cells of other classes."""
         if given.then == "repeat" and len(set(cells)) < 2:
             return "to repeat, expected two different places or more"
         if agent_of(given.vehicle) not in self._on_ground:

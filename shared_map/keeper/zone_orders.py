@@ -49,7 +49,7 @@ def zone_sets(
     now_ns: int,
     numbers: Mapping[str, int],
 ) -> list[MarkSet] | str:
-    """The sets which make, move or end a zone; why that cannot be, in a sentence.
+    """Returns the sets which make, move or end a zone, or a sentence why that is impossible.
 
     order    names a zone
     aside    author -> what compaction set aside of its set of a tile

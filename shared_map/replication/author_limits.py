@@ -69,7 +69,7 @@ class Capacity:
         return True
 
     def free(self, old: MarkSet) -> None:
-        """`old` is held no more."""
+        """Notes that a set is not held any more."""
         self._count(owner_of(old.author), -1, -len(old.kinds))
 
     def full_for(self, author: str) -> bool:

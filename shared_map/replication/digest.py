@@ -37,12 +37,12 @@ class Ledger:
         self._rows: dict[str, NDArray[np.void]] = {}  # author -> the same in order of tile, until one changes
 
     def record(self, author: str, tile: int, epoch: int, seq: int) -> None:
-        """An author's set of this tile is held under this number."""
+        """Notes that an author's set of this tile is held under this number."""
         self._numbers.setdefault(author, {})[tile] = (epoch, seq)
         self._rows.pop(author, None)
 
     def drop(self, author: str, tile: int) -> None:
-        """An author's set of this tile is held no more."""
+        """Notes that an author's set of this tile is not held any more."""
         numbers = self._numbers.get(author, {})
         if numbers.pop(tile, None) is not None:
             self._rows.pop(author, None)
@@ -73,7 +73,7 @@ class Ledger:
         return digest_rows((tile, *numbers[tile]) for tile in sorted(tiles) if tile in numbers).tobytes()
 
     def missing(self, theirs: Held) -> list[tuple[str, list[int]]]:
-        """(author, tiles) of which they hold a newer set than we."""
+        """Returns (author, tiles) of each author of whom they hold newer sets than we."""
         found = []
         for author in sorted(theirs):
             rows = np.frombuffer(theirs[author], DIGEST_ROW)
@@ -193,7 +193,7 @@ _ROWS = 16
 
 
 _LAST = (1 << 62, 0)
-"""In place of what is known of a sender that was forgotten."""
+"""Default for senders that were forgotten."""
 
 
 @dataclass(slots=True)
@@ -284,7 +284,7 @@ class PendingDigests:
             yield each
 
     def compared(self, pending: PendingDigest, complete: bool, now_ns: int) -> None:
-        """It was compared: done if all that it names is held, else due again soon, ten times at most."""
+        """Notes a comparison: a digest is done if all of its sets are held, else due again, at most ten times."""
         pending.tries += 1
         if complete or pending.tries > _MAX_TRIES:
             self._drop(pending)

@@ -132,7 +132,7 @@ class HeldSets:
             self.remove(held)
 
     def remove(self, held: MarkSet) -> None:
-        """Forgets a set as if it had never come."""
+        """Removes a set as if it had never been received."""
         sets = self._tiles[held.tile]
         del sets[held.author]
         if not sets:

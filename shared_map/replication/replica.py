@@ -266,7 +266,7 @@ class MapReplica:
             heapq.heapify(self._expiries)
 
     def _expire(self, now_ns: int) -> None:
-        """Gives cells whose winner expired their next one. What we state ourselves does not expire."""
+        """Gives cells whose winning mark expired the next one. Our own marks do not expire."""
         before_ns, self._now_ns = self._now_ns, max(now_ns, self._now_ns)
         expired: dict[int, list[MarkSet]] = {}
         while self._expiries and self._expiries[0][0] <= now_ns:
@@ -330,7 +330,7 @@ class MapReplica:
         self._put_own(tile, marks.sparse(own))
 
     def write_learned(self, measured: Mapping[int, Measurement], now_ns: int) -> list[MarkSet]:
-        """States what we have learned (`shared_map.learned_factors`), instead of what was stated before."""
+        """Publishes our measurements (`shared_map.learned_factors`) instead of the previous ones."""
         self._put_own(beyond_tile(self.grid), marks.Statements(*columns_of(measured, now_ns)))
         return self.tick(now_ns)
 

@@ -36,7 +36,7 @@ if TYPE_CHECKING:
 
 FORMAT = 7
 """Raised when what lies in a prepared folder, or how terrain is built, changes."""
-_ALL_LETHAL = "every cell of the terrain is lethal, no vehicle could stand anywhere:"
+_ALL_LETHAL = "every cell of the terrain is lethal, so no vehicle has a place:"
 
 
 @dataclass(frozen=True, eq=False)

@@ -122,8 +122,8 @@ def said_of(terrain: Terrain) -> list[str]:
 
 
 def notes_and_doubts(terrain: Terrain, facts: dict[str, Any]) -> tuple[list[str], list[str]]:
-    """Returns what was done to a terrain, and what looks wrong with it. Notes of importers which begin with `!` are
-    doubts."""
+    """Returns the notes of a terrain: processing steps, and possible mistakes. Notes of importers which begin with
+    `!` are possible mistakes."""
     doubts = [note.removeprefix(_DOUBT) for note in terrain.notes if note.startswith(_DOUBT)]
     return [note for note in terrain.notes if not note.startswith(_DOUBT)], [*doubts, *doubts_about(facts)]
 

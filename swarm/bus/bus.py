@@ -124,8 +124,8 @@ TIMEOUT_PARAMETER = "timeout_s"
 USUAL_TIMEOUT_S = 10.0
 """Timeout (s) of a query without that parameter: the default of Zenoh's own `get`."""
 QUESTION_BYTES = 8 << 20
-"""Bytes of all queries that wait in a process: more than it decodes in half a second. Those that come then are
-refused, or end without an answer."""
+"""Bytes of all queries that wait in a process: more than it decodes in half a second. Further queries are
+refused, or end without a reply."""
 QUESTION_COST_BYTES = 1 << 10
 """Cost of a query beside its request, in memory and work, as bytes of a request."""
 LONGEST_TIMEOUT_S = 60.0

@@ -53,7 +53,7 @@ class Orders:
         return self._give(subject="pause")
 
     def resume(self) -> Acknowledged:
-        """Resumes all."""
+        """Resumes all vehicles and simulated targets after `pause`."""
         return self._give(subject="pause", off=True)
 
     def stop(self, vehicle: str) -> Acknowledged:
@@ -74,11 +74,11 @@ class Orders:
         return self._operator.give(order)[1]
 
     def recall(self, vehicle: str) -> Acknowledged:
-        """Returns it to the chase of targets."""
+        """Ends the places of a vehicle, which then chases targets again."""
         return self._operator.give(checked(SendVehicle, {"vehicle": vehicle, "off": True}))[1]
 
     def goals(self) -> list[VehicleGoals]:
-        """The places to which vehicles were sent."""
+        """Returns the places to which each vehicle was sent."""
         return list(self._operator.goals().goals)
 
     def chase(self, group: str, targets: Sequence[str] | None) -> Acknowledged:
@@ -89,12 +89,17 @@ class Orders:
     def add_target(
         self, id: str, x_m: float, y_m: float, *, walk: str | None = None, speed_m_per_s: float | None = None
     ) -> Acknowledged:
-        """Puts a new simulated target somewhere."""
+        """Adds a simulated target.
+
+        x_m, y_m       its start, in metres of the terrain's frame
+        walk           still, random, waypoints (default) or evade
+        speed_m_per_s  on level open ground, 4 by default
+        """
         cell = self._session.frame.cell(x_m, y_m)
         return self._give(subject="target", name=id, cell=cell, walk=walk, speed_m_per_s=speed_m_per_s, new=True)
 
     def move_target(self, id: str, x_m: float, y_m: float) -> Acknowledged:
-        """Puts a simulated target somewhere else."""
+        """Moves a simulated target to a place (m, in the terrain's frame), from which it goes on."""
         return self._give(subject="target", name=id, cell=self._session.frame.cell(x_m, y_m))
 
     def remove_target(self, id: str) -> Acknowledged:
@@ -135,7 +140,7 @@ class Orders:
         return self._operator.zone(checked(ZoneOrder, {"action": "remove", "name": name}))[1]
 
     def zones(self) -> list[Zone]:
-        """The zones that stand."""
+        """Returns the active zones."""
         return list(self._operator.zones().zones)
 
     def given(self) -> list[Order]:
@@ -155,7 +160,7 @@ class Swarm:
 
     It may be used from any thread. Callbacks come on a thread of its own, one after the other.
 
-    A lost link comes back by itself, and everything that vehicles and targets said last is said again at once.
+    A lost link is restored, and the last statements of vehicles and targets are then sent again immediately.
     Meanwhile nothing raises: published messages are lost, `connected` is false, and leases expire. If another run
     is in the namespace when the link is back, every call raises RunMismatchError, as cells may mean other places
     there.
@@ -185,6 +190,7 @@ class Swarm:
 
     @property
     def run_id(self) -> str:
+        """Id of the run, equal in all of its processes."""
         return self._session.run.run_id
 
     @property
@@ -231,8 +237,8 @@ class Swarm:
         """A vehicle that is not the swarm's own. It exists for others from the first `Vehicle.at` on.
 
         id             letters, digits, '_' and '.'; not of any other vehicle
-        group          whose it is
-        radius_m       around its place, which others keep clear
+        group          of the scenario, which owns the vehicle and reads its marks
+        radius_m       of the circle around its place which others keep clear, up to 100 m
         lease_s        others avoid its last place for this time after its last message
         right_of_way   it may reserve cells, which no other vehicle enters then (`Vehicle.reserve`). Works for the
                        swarm's user only, or with the certificate `rover.GROUP.ID`. The state for its next
@@ -268,7 +274,7 @@ class Swarm:
         """A target of the scenario that this program tracks: its walk there is `external`.
 
         id       of the target
-        tracker  name of this tracker, the same after a restart: it goes on at once then
+        tracker  name of this tracker; one that restarts under its old name continues at once
         lease_s  after this time without a pose the target is lost, or the next tracker owns it
         """
         return Target(self._session, id, tracker, lease_s)
@@ -278,7 +284,7 @@ class Swarm:
     ) -> Future[Route]:
         """The best route to a target from any place, without waiting and without a vehicle.
 
-        Its failure is a BusError. Raises ConfigError on a place outside the terrain.
+        The future fails with BusError if no planner replies. Raises ConfigError on a place outside the terrain.
         """
         return self._session.ask_route(target, self.frame.cell(x_m, y_m), vehicle_class, timeout_s)
 
@@ -320,14 +326,14 @@ class Swarm:
         return Observer(self._session, self._session.number("every_s", every_s, 0, 1e6, more=True))
 
     def on_problem(self, callback: Callable[[str], None]) -> None:
-        """Calls with a sentence when something goes wrong that no call can raise: another process uses one of our
-        ids, a planner does not answer. Each problem is reported at most once a minute, logged, and counted in
-        `counts`."""
+        """Registers a callback, which gets a sentence about each problem that no call can raise: another process
+        uses one of our ids, a planner does not answer. Each problem is reported at most once a minute, logged, and
+        counted in `counts`."""
         self._session.on_problem(callback)
 
     def close(self) -> None:
-        """Takes away all vehicles and targets of this program, and leaves. May be repeated; the end of the program
-        does it, too."""
+        """Removes all vehicles and targets of this program, and disconnects. May be repeated; the end of the
+        program does it, too."""
         atexit.unregister(self.close)
         self._stop()
         self._session.close()
@@ -342,7 +348,7 @@ def connect(
     key: str | None = None,
     timeout_s: float = 10.0,
 ) -> Swarm:
-    """Connect to a running swarm and learn its terrain.
+    """Connects to a running swarm and reads its terrain.
 
     endpoint          of a router; beyond this machine `tls/HOST:PORT`, with the three files
     namespace         the scenario's `network.namespace`

@@ -66,7 +66,7 @@ class SeenTarget:
 
 @dataclass(frozen=True, slots=True)
 class Mark:
-    """Current state of a marked cell: lethal, or the time that a metre takes."""
+    """Current state of a marked cell: lethal, or its pace in s/m."""
 
     lethal: bool
     pace_s_per_m: float | None
@@ -106,7 +106,7 @@ class Observer:
 
     @property
     def vehicles(self) -> Mapping[str, SeenVehicle]:
-        """Those heard of in the last seconds, by id."""
+        """Vehicles whose reports are still valid, by id."""
         with self._session.lock:
             now_ns = self._session.now_ns()
             seen: dict[str, SeenVehicle] = {}
@@ -144,7 +144,7 @@ class Observer:
             return {id: self._points(id) for id in self._routes}
 
     def take_routes(self) -> Mapping[str, list[tuple[float, float]]]:
-        """Those of `routes` that have come since the last call."""
+        """Returns the entries of `routes` that are new since the last call."""
         with self._session.lock:
             taken, self._new_routes = self._new_routes, {}
             return {id: self._points(id) for id in taken}

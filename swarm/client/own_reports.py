@@ -96,7 +96,7 @@ class Reported:
             self._repeat(now_ns)
 
     def leave(self) -> None:
-        """Takes it away: others know at once. May be repeated."""
+        """Removes the vehicle or target; others receive this at once. May be repeated."""
         session = self._session
         with session.lock:
             if self._word is not None and session.ended is None:

@@ -114,7 +114,7 @@ class Session:
             self._parts = [each for each in self._parts if each is not part]
 
     def check_open(self) -> None:
-        """Raises why nothing can be said any more."""
+        """Raises the reason if the session has ended."""
         if self.ended is not None:
             raise self.ended
 
@@ -168,7 +168,7 @@ class Session:
         return classes.index(name) + 1
 
     def ask(self, topic: Topic, request: Message, timeout_s: float, **fields: str) -> Future[list[Any]]:
-        """All answers to a question. Its failure is a BusError."""
+        """Sends a query. Returns a future of all replies, which fails with BusError after `timeout_s` (s)."""
         timeout_s = self.number("timeout_s", timeout_s, 0, 1e9)
         self.check_open()
         waiting: Future[list[Any]] = Future()

@@ -77,7 +77,7 @@ class Frame:
         return self.grid.centre_m(checked_cells(self, (cell,))[0])
 
     def cells_within(self, x_m: float, y_m: float, radius_m: float) -> list[int]:
-        """The cells whose middle is within a radius of a place inside the terrain, and the cell of the place."""
+        """Returns the cells whose middle is within `radius_m` of a place inside the terrain, and its own cell."""
         at, step, radius_m = self.cell(x_m, y_m), self.grid.resolution_m, number("radius_m", radius_m)
         if not 0 <= radius_m < math.inf:
             raise ConfigError(f"radius_m is {radius_m!r}, expected metres, 0 or more")

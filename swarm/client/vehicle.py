@@ -186,8 +186,8 @@ class Vehicle(Reported):
 
     def at(self, x_m: float, y_m: float, *, heading_rad: float | None = None, speed_m_per_s: float = 0.0) -> None:
         """States where the vehicle is. From their next tick on, all vehicles of the swarm avoid this place and
-        the places ahead. It is sent again and again until the next call or `leave`: without another call the
-        vehicle counts as at rest.
+        the places ahead. The library repeats it until the next call or `leave`: without another call the vehicle
+        counts as at rest.
 
         x_m, y_m       in the terrain's frame; of a latitude and longitude: `at(*swarm.frame.from_wgs84(lat, lon))`
         heading_rad    clockwise from north; None if it may go any way
@@ -215,7 +215,7 @@ class Vehicle(Reported):
 
     @property
     def cell(self) -> int:
-        """The cell that it said it is in. Raises ConfigError before the first `at`."""
+        """Cell of the last reported position. Raises ConfigError before the first `at`."""
         if self._word is None:
             raise ConfigError(f"vehicle {self.id} has not said where it is: call at() first")
         return self._session.frame.cell(self._word.x_m, self._word.y_m)
@@ -227,8 +227,8 @@ class Vehicle(Reported):
         self._way = way
 
     def reserve(self, cells: Sequence[int], timeout_s: float = 0.0) -> list[int]:
-        """States into which cells the vehicle would drive next, in driving order, such as the next ones of a route,
-        and waits until it may enter the first. Returns the cells that it may enter now: no other vehicle enters
+        """Requests cells in driving order, such as the next ones of a route, and waits up to `timeout_s` (s) until
+        the vehicle may enter the first. Returns the cells that it may enter now: no other vehicle enters
         them before the vehicle has left them by its `at`. Reserved cells that are not in `cells` are released.
 
         Raises ConfigError if a cell is not beside the one before it, and unless the vehicle was made with

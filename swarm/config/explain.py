@@ -285,7 +285,7 @@ def _unknown(key: str, name: str, section: Any, root: type) -> str:
     near = nearest(key, allowed)
     elsewhere = [place for place, other in _places(root) if other is not section and _holds(other, key)]
     if elsewhere and not difflib.get_close_matches(key, allowed, n=1, cutoff=0.75):
-        return f"unknown key {where}; {key} stands {' or '.join(elsewhere[:3])}"
+        return f"unknown key {where}; {key} belongs {' or '.join(elsewhere[:3])}"
     every = _allowed_here(allowed)
     return f"unknown key {where}{near}" + (f"; {every}" if not near or len(every) <= _LONGEST_LIST else "")
 
@@ -337,11 +337,9 @@ def _wrong(name: str, value: Any, hint: Any) -> str:
 
 
 def _finite(value: Any) -> str:
-    """Returns the bounds without the largest number of the type, which no user meets by chance."""
+    """Returns the bound of numbers which their type has beyond those that are said; no user meets it by chance."""
     is_number = isinstance(value, int | float) and not isinstance(value, bool)
-    if not is_number or abs(value) < UNBOUNDED:
-        return "" if value == value else ", which nan is not"
-    return ", and not as large as that"
+    return ", and not as large as that" if is_number and abs(value) >= UNBOUNDED else ""
 
 
 def _meant_number(key: str, value: Any, kind: Any) -> str:

@@ -168,7 +168,7 @@ def parse_toml(text: str, source: str, error: type[SwarmError]) -> dict[str, Any
 
 
 _TOML_FAULTS = {
-    "Invalid value": "no value that TOML knows: text goes in quotes, true and false in small letters",
+    "Invalid value": "no value of TOML: put text in quotes, and write true and false in small letters",
     "Illegal character '\\n'": "a quote is missing at the end",
     "Unterminated string": "a quote is missing at the end",
     "Cannot overwrite a value": "a key is set twice, or a value would be a table",

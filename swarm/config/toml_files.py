@@ -99,7 +99,7 @@ def read_scenario(
             taken_out.add(place)
             if not _take_out(raw, place):
                 break
-    if scenario is None or faults:  # what is left names its files, whatever the rest is
+    if scenario is None or faults:  # the valid rest names its files
         return None if scenario is None else anchored(scenario, base or Path()), faults
     scenario = msgspec.convert(complete_costs(raw), Scenario)  # only now, so that a fault of [cost] is one fault
     try:
@@ -187,7 +187,7 @@ def _faults(scenario: Scenario, source: str) -> Iterator[str]:
     yield from (f"{source}: {each}" for what, names in named.items() for each in doubled(names, what))
     for id in ids:
         if split_rank(id)[1]:  # planner and standby of two targets would share an id
-            yield f"{source}: targets: {id!r} is what a standby of another target is called; rename it"
+            yield f"{source}: targets: {id!r} is the name of a standby of another target; rename it"
     for key, section in (("cost", scenario.cost), ("terrain.hidden", scenario.terrain.hidden)):
         for n, zone in enumerate(section.zones):
             yield from complaint(_check_zone, zone, f"{source}: {key}.zones[{n}]")

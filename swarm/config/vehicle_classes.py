@@ -131,7 +131,7 @@ def check_cost(cost: CostConfig, source: str) -> None:
         )
     for key in ("max_climb_deg", "max_descent_deg"):
         if getattr(cost, key) is not None and not cost.directional:
-            raise ConfigError(f"{where}.{key} is about steps: set directional = true, or max_slope_deg instead")
+            raise ConfigError(f"{where}.{key} limits single steps: set directional = true, or use max_slope_deg")
 
 
 def _check_table(cost: CostConfig, where: str) -> None:
@@ -141,13 +141,13 @@ def _check_table(cost: CostConfig, where: str) -> None:
     for (slope, _), (following, _) in pairwise(points):
         if following <= slope:
             raise ConfigError(
-                f"{where}.slope_table: {following:g} degrees follow on {slope:g}, expected rising slopes"
+                f"{where}.slope_table: {following:g} degrees come after {slope:g}, expected rising slopes"
             )
     level = factor_at(points, 0.0)
     if abs(level - 1) > _LEVEL_TOLERANCE:
         raise ConfigError(
-            f"{where}.slope_table: level ground takes {level:g} times the flat pace, expected 1: how fast level"
-            f" ground is, flat_speed_m_per_s = {cost.flat_speed_m_per_s:g} says"
+            f"{where}.slope_table: level ground takes {level:g} times the flat pace, expected 1: the speed on"
+            f" level ground is set by flat_speed_m_per_s = {cost.flat_speed_m_per_s:g}"
         )
 
 
@@ -256,9 +256,8 @@ def class_faults(scenario: Scenario, source: str) -> Iterator[str]:
         yield from (f"{source}: classes[{n}]{fault}" for fault in own if fault not in held)
         if each.air is not None and not scenario.wind.speed_m_per_s < each.air.speed_m_per_s:
             yield (
-                f"{source}: classes[{n}].air.speed_m_per_s: expected more than wind.speed_m_per_s,"
-                f" {scenario.wind.speed_m_per_s:g}, as {each.name} makes no headway else; found"
-                f" {each.air.speed_m_per_s:g}"
+                f"{source}: classes[{n}].air.speed_m_per_s: found {each.air.speed_m_per_s:g}, expected more than"
+                f" wind.speed_m_per_s = {scenario.wind.speed_m_per_s:g}: {each.name} could not fly against it"
             )
         for k, zone in enumerate(each.air.no_fly if each.air is not None else ()):
             drawn = zone.polygon is not None or zone.polygon_m is not None

@@ -53,7 +53,7 @@ class OwnTime:
 
 
 _FIRST_ANSWERS_NS = 3 * NS_PER_S // 10
-"""A new generation waits this time for the others' answers before it begins. What comes later counts as well."""
+"""A new generation waits this time for the others' answers before it begins. Later answers count, too."""
 _LATE_ANSWERS_S = 10.0
 """Time within which answers after the first wait still count. Chosen, not measured."""
 _ASK_AGAIN_NS = NS_PER_S

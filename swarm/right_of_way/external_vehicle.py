@@ -51,7 +51,7 @@ class Answers:
         return self.agreed
 
     def end_query(self) -> list[Known]:
-        """All that answered one query have done so. Returns the answers that count."""
+        """Notes that all replies to one query have arrived. Returns the replies that count."""
         self._queries += 1
         return self.agreed
 

@@ -316,7 +316,7 @@ class Leader:
                 round.plan(mover, pushed=self._orders.is_followed(mover.cell, mover.id))
             elif (ahead := self._next_ahead(stand)) and not self._orders.waits(stand.vehicle):
                 self._grant(stand, ahead, round.taken)
-        # Who makes way first, so that others may follow it.
+        # Vehicles that make way are granted first, so that others may follow them.
         standing = {mover.cell: id for id, mover in movers.items() if not mover.outside}
         granted: set[str] = set()
         for stand in [each for each in asking if each.vehicle in round.to]:

@@ -272,7 +272,7 @@ TABLE = Topic(
 """Granted cells of a shard, from its leader to a member; a member that is asked promises an epoch and replies with
 its stored table.
 
-Rate: on change, and at 5 Hz until both others have it on file
+Rate: on change, and at 5 Hz until the others have it on file
 """
 GRANTED = Topic(
     "granted", "granted/{shard}/{host}/{agent}", traffic.Granted,

@@ -83,7 +83,7 @@ class Follower:
         return self._bounds
 
     def moved(self, cell: int) -> None:
-        """The vehicle has entered a cell: the next one of its route, or one further on, or none."""
+        """Notes the cell that the vehicle has entered: the next one of its route, one further on, or none of it."""
         index = self._find(cell)
         if index is not None:
             self._at = index
@@ -273,7 +273,7 @@ class Vehicle:
     # --- targets and planners -------------------------------------------------------------------------------
 
     def assign(self, target: str, now_ns: int) -> None:
-        """Goes for this target from now on."""
+        """Makes the vehicle chase this target, or drive to this place, from now on."""
         if target == self.target and self.state is not VehicleState.STRANDED:
             self._settle()
             return
@@ -286,14 +286,14 @@ class Vehicle:
         self._need_route(Reason.ASSIGNED, now_ns)
 
     def release(self) -> None:
-        """Goes for no target any more, until another is assigned."""
+        """Leaves the vehicle without a target until another is assigned."""
         self.target = self.goal = self.asked = self._need = None
         self.in_reach = self.planner_gone = self.searching = False
         self.route.drop()
         self.state = VehicleState.IDLE
 
     def no_way(self) -> None:
-        """Every planner has answered, and none knows a route from here."""
+        """Notes that all planners have replied, and none has a route from here."""
         if not self.in_reach and self._strands():
             self._need = None
         self._settle()
@@ -322,7 +322,7 @@ class Vehicle:
         self._settle()
 
     def target_jumped(self, now_ns: int) -> None:
-        """Its target is somewhere else, or is seen again."""
+        """Notes that its target is suddenly elsewhere, or is seen again."""
         self.searching = False
         if self.in_reach:
             self._settle()
@@ -375,7 +375,7 @@ class Vehicle:
         return begun
 
     def refuse_route(self, target: str, status: RouteStatus, now_ns: int) -> None:
-        """The planner of a target knows no route."""
+        """Notes that the planner of a target has no route, and why."""
         self.asked = None
         if target == self.target:
             if status is RouteStatus.NO_TARGET:
@@ -386,17 +386,17 @@ class Vehicle:
         self._settle()
 
     def no_answer(self, now_ns: int) -> None:
-        """The request ended without a usable route: ask again, later each time."""
+        """Notes that a request ended without a usable route: the next one waits longer each time."""
         self.asked = None
         self._ask_later(now_ns)
         self._settle()
 
     def cut_route(self, now_ns: int) -> None:
-        """A cell ahead is closed, and the route now ends before it."""
+        """Notes that the route now ends before a closed cell."""
         self._need_route(Reason.CUT, now_ns)
 
     def blocked_for_long(self, now_ns: int) -> None:
-        """It was pushed off its route, or has stood for long: the planner may know another route."""
+        """Notes that it was pushed off its route, or has not moved for long: the planner may know another route."""
         if self._need is None:
             self._need_route(Reason.BLOCKED, now_ns)
 

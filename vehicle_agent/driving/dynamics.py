@@ -98,7 +98,7 @@ class Inertia:
 
 
 class Dynamics(Protocol):
-    """Says how fast vehicles drive. A plug-in is made as `Name(world: DynamicsWorld, options)`."""
+    """Decides the speed of vehicles. A plug-in is made as `Name(world: DynamicsWorld, options)`."""
 
     def speed(self, stretch: Stretch) -> float:
         """m/s on this stretch; more than the limit is cut to that, 0 stands still."""

@@ -172,8 +172,8 @@ class Steering:
             )
             return Wish(ahead, wants, len(wants), _OLDEST_MS)
         if ahead and ahead[0] in cost and ahead[0] not in one_way:
-            # Who stands on its route asks for the next cell, even while another holds it: it would hear a round
-            # trip after others that the cell is free.
+            # A vehicle on its route requests the next cell even while another holds it: otherwise its request would
+            # come a round trip after those of others, once the cell is free.
             cost[ahead[0]] = min(cost[ahead[0]], stays - _LEAST_GAIN)
         wants = sorted(cost, key=lambda cell: (cell in one_way, cost[cell], hash((lot, cell))))
         better = sum(cost[cell] < stays and cell not in one_way for cell in wants)

@@ -306,7 +306,7 @@ def _faults(settings: Settings) -> Iterator[str]:
         if changes.topic:
             yield from _topic_faults(changes.topic, row.per, f"topics.{name}.topic")
         if changes.hz and row.hz is None:
-            yield f"topics.{name}.hz: {name} is put when something changes, and has no rate"
+            yield f"topics.{name}.hz: {name} is published on change, and has no rate"
     topics = Counter(row.topic for row in settings.rows())
     yield from (f"topics: two topics are called {topic}; rename one" for topic, many in topics.items() if many > 1)
     if settings.frames.map == TERRAIN_FRAME:
@@ -327,7 +327,7 @@ def _incoming_faults(settings: IncomingSettings) -> Iterator[str]:
     for n, robots in enumerate(settings.robots):
         where, part = f"robots[{n}]", ROBOT
         if (part in robots.topic) != (robots.id is None):
-            yield f"{where}: topic is {robots.topic!r}, expected {part} in it, or an id and none in it"
+            yield f"{where}: topic is {robots.topic!r}, expected one with {part}, or an id and a topic without it"
         own = {key: getattr(robots, key).replace(part, robots.id or part) for key in ("topic", "plan", "goal")}
         if len(set(own.values())) < len(own):
             yield f"{where}: topic, plan and goal are {', '.join(own.values())}, expected three topics"

@@ -251,7 +251,7 @@ def is_keeper(author: str) -> bool:
 
 
 MOST_TILES_ASKED = 4096
-"""In one question: the tiles of 64 regions. Who needs more asks again."""
+"""Tiles in one query: those of 64 regions. A process that needs more queries again."""
 
 
 class MarksRequest(Message, frozen=True, kw_only=True, tag=schema_of("marks-request")):

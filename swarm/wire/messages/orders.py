@@ -192,7 +192,7 @@ class GiveOrder(Message, frozen=True, kw_only=True, tag=schema_of("give-order"))
         if self.name:
             fields.check_id("name", self.name)
         elif self.subject not in (None, "pause"):
-            raise ValueError(f"name is missing: which {self.subject} is it about?")
+            raise ValueError(f"name is missing: the order needs the name of a {self.subject}")
         places = (self.row is not None) + (self.cell is not None) + bool(self.at)
         if (self.row is None) != (self.col is None) or places > 1:
             raise ValueError("give either cell, or row and col, or at")

@@ -116,7 +116,7 @@ def test_a_plan_is_shown_and_written_for_each_machine(tmp_path: Path, scenario: 
     assert shown.exit_code == 0
     assert {"m1", "m2", "m3"} <= set(shown.stdout.split())
     assert (
-        "the run survives the loss of any 1 of its 3 machines; the vehicles of a lost machine stand" in shown.stdout
+        "the run survives the loss of any 1 of its 3 machines; the vehicles of a lost machine stop" in shown.stdout
     )
     assert " records the run and writes its report" in shown.stdout
     assert not kits.exists()

@@ -66,7 +66,7 @@ def test_an_address_of_version_6_is_written_in_brackets_and_standbys_need_machin
     first, other, *_ = planned(machines=hosts("fd00::1", "10.0.0.1", "10.0.0.2")).hosts
     assert "tls/[fd00::1]:7447" in other.connect
     assert first.listen == ("tls/[::]:7447",)
-    with pytest.raises(ConfigError, match="'planner' is among the roles of 3 machines, expected at least 4"):
+    with pytest.raises(ConfigError, match="3 machines have the role 'planner', expected 4 or more"):
         planned(f"{SCENARIO}[standbys]\nplanner = 3\n")
 
 

@@ -147,7 +147,7 @@ def test_what_cannot_be_ordered_is_refused_in_a_sentence(fields: dict[str, Any],
 @pytest.mark.parametrize(
     ("fields", "says"),
     [
-        ({"subject": "vehicle"}, "which vehicle is it about"),
+        ({"subject": "vehicle"}, "needs the name of a vehicle"),
         ({"subject": "vehicle", "name": "a b"}, "name 'a b' is not"),
         ({"subject": "target", "name": "x"}, "give the target's place"),
         ({"subject": "target", "name": "x", "row": 1}, "give either cell, or row and col"),

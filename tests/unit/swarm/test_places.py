@@ -93,7 +93,7 @@ def test_two_bare_whole_numbers_are_never_taken_for_what_they_may_not_be(first: 
         ("nan,nan", ALPS, "expected LAT,LON"),
         ("", ALPS, "expected LAT,LON"),
         ("1" * 400, ALPS, "expected LAT,LON"),
-        ("latlon:1e999,1", ALPS, r"no latitude \(-90 to 90\)"),
+        ("latlon:1e999,1", ALPS, r"expected a latitude \(-90 to 90\)"),
         ("1e999,1", ALPS, "outside the terrain"),
         ("500100.5,5199900", ALPS, "; did you mean 'xy:500100.5,5199900'\\?$"),
         ("xy:5199900,500100", ALPS, "; did you mean 'xy:500100,5199900'\\?$"),
