@@ -76,6 +76,18 @@ def test_every_command_answers_to_h_as_to_help(swarm: Swarm, monkeypatch: pytest
         assert each.context_settings.get("help_option_names", ["-h"])[0] == "-h", path
 
 
+def test_help_has_the_bounds_of_a_number_once_and_in_words(swarm: Swarm, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    commands = {
+        ("terrain", "generate"): ["INTEGER Cells from north to south. [8 to 16384]", "[at least 0]"],
+        ("gateway", "mavlink"): ["NUMBER Altitude (m) of a flying vehicle. [1 to 10000]"],
+    }
+    for path, rows in commands.items():
+        said = " ".join(swarm("", *path, "-h")[1].replace("│", " ").split())
+        assert all(row in said for row in rows), said
+        assert not {"<int", "<float", "<int>", "<float>"}.intersection(said.split())
+
+
 def test_the_short_help_fits_a_terminal(swarm: Swarm, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("COLUMNS", "80")
     rows = swarm("-h")[1].splitlines()
