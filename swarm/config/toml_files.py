@@ -58,7 +58,7 @@ def load_scenario(path: Path) -> Scenario:
 
 
 class Reading(NamedTuple):
-    """What the text of a scenario says.
+    """Content of the text of a scenario.
 
     scenario  a key that could not be read has its default; None if that is not enough
     faults    a sentence each
