@@ -4,7 +4,7 @@ is built (whether its locations are on passable ground, and connected). `check_s
 from __future__ import annotations
 
 import random
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -155,14 +155,13 @@ def _certificates(scenario: Scenario, tls: TlsConfig, whole: bool) -> Iterator[F
         yield failure("network.tls", f"{tls.certificate} has no certificate of {lacking[0]}{several}; {make}")
 
 
-def plugins(scenario: Scenario, roles: Collection[str] = ROLES) -> Iterator[Finding]:
+def plugins(scenario: Scenario) -> Iterator[Finding]:
     """Plug-ins that cannot be imported, or do not take their options. Runs their modules."""
     for named in plugins_of(scenario):
-        if named.kind.role in roles or named.kind.role == "any":
-            try:
-                find_plugin(named, scenario.plugin_folder)
-            except SwarmError as error:
-                yield failure(named.key, str(error).removeprefix(f"{named.key}: "))
+        try:
+            find_plugin(named, scenario.plugin_folder)
+        except SwarmError as error:
+            yield failure(named.key, str(error).removeprefix(f"{named.key}: "))
 
 
 def check_start(scenario: Scenario, *, joins: bool, has_ground: bool) -> None:

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import json
 import re
-from functools import partial
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import msgspec
 import typer
@@ -34,7 +33,6 @@ from swarm.errors import ConfigError
 from swarm.files import write_file
 
 app = family_app("A plan, certificates and configurations for several machines.")
-KitName = Literal["systemd", "compose"]
 Days = Annotated[int, typer.Option(min=1, max=3650)]
 _IMAGE = r"[A-Za-z0-9][A-Za-z0-9_.:/-]{0,251}:[A-Za-z0-9_][A-Za-z0-9_.-]{0,123}"
 """With a tag, which "-all" may be added to: no digest."""
@@ -47,7 +45,7 @@ def plan(
     scenario: ScenarioArgument,
     hosts: Annotated[Path, typer.Option()],
     out: Path | None = None,
-    kit: KitName = "systemd",
+    kit: archives.KitName = "systemd",
     image: str = "",
     wheel: Path | None = None,
     days: Days = 365,
@@ -92,7 +90,7 @@ def plan(
     if out is None and (image or wheel is not None):
         raise ConfigError("--image and --wheel go into what --out writes, and it is not given")
     check_start(chosen, joins=True, has_ground=True)
-    written = [] if out is None else _write(made, out, kit, image, days, wheel)
+    written = [] if out is None else archives.write_kits(made, out, days, kit, image=image, wheel=wheel)
     if as_json:
         typer.echo(json.dumps({**plan_fields(made), "archives": list(map(str, written))}, indent=2))
         return
@@ -103,16 +101,7 @@ def plan(
         typer.echo(f"{out / 'certs'}: operator.0 for your own commands, and the authority; keep ca.key to yourself")
 
 
-def _write(made: Plan, out: Path, kit: KitName, image: str, days: int, wheel: Path | None) -> list[Path]:
-    if kit == "systemd":
-        return archives.write_kits(made, out, archives.systemd_files, days, wheel)
-    compose = partial(
-        archives.compose_files, image=image, revoked=revocations.revoked_in(out / archives.CERTIFICATES)
-    )
-    return archives.write_kits(made, out, compose, days, launcher=False)
-
-
-def _show(made: Plan, kit: KitName) -> None:
+def _show(made: Plan, kit: archives.KitName) -> None:
     # One column a machine: names of processes are many and short, machines few.
     table = Table(box=None, padding=(0, 2, 0, 0), header_style="bold")
     table.add_column("")
@@ -233,16 +222,15 @@ def certs(
         bearer(name)
     revoked = {*chosen.network.revoked, *revocations.revoked_in(folder)}
     for name in dict.fromkeys(wanted):
-        path, again = folder / f"{name}.pem", renew
+        path, called = folder / f"{name}.pem", common_name(name, revoked)
         hosts = [host for host in given.get(name, "").split(",") if host]
         if bearer(name).role == ROUTER:
             hosts += certificates.THIS_MACHINE
-        if name not in given and (again := path.exists()):
-            if certificates.may_stay(path, (), certificates.called_of(path)):
+        if name not in given and path.exists():
+            if certificates.may_stay(path, (), called):
                 continue
             hosts = sorted(certificates.hosts_of(path))
-        called = common_name(name, revoked)
-        certificates.issue(folder, name, hosts, days, renew=again, called=called)
+        certificates.issue(folder, name, hosts, days, renew=renew or name not in given, called=called)
         print(f"{path}, {path.with_suffix('.key')}: {called}, good until {certificates.ends_on(path)}")
     print(f"authority: {folder / 'ca.pem'}; keep {folder / 'ca.key'} to yourself")
 

@@ -45,7 +45,7 @@ def planned(text: str = SCENARIO, machines: HostsConfig = THREE, base: Path | No
 
 def unpacked(plan: Plan, out: Path) -> list[Path]:
     """Writes archives and unpacks them; the folder of each machine."""
-    archives = write_kits(plan, out, systemd_files, 7)
+    archives = write_kits(plan, out, 7)
     for archive in archives:
         assert stat.S_IMODE(archive.stat().st_mode) == 0o600
         with tarfile.open(archive) as file:
@@ -100,9 +100,9 @@ def test_a_second_plan_keeps_keys_that_need_not_be_others(tmp_path: Path) -> Non
     def keys() -> dict[str, bytes]:
         return {path.stem: path.read_bytes() for path in certs.glob("*.key")}
 
-    write_kits(planned(), tmp_path, systemd_files, 7)
+    write_kits(planned(), tmp_path, 7)
     before = keys()
-    write_kits(planned(machines=hosts("10.0.0.1", "10.0.0.9", "10.0.0.3")), tmp_path, systemd_files, 7)
+    write_kits(planned(machines=hosts("10.0.0.1", "10.0.0.9", "10.0.0.3")), tmp_path, 7)
     assert {name for name, key in keys().items() if key != before[name]} == {"router.1"}
     before = keys()
     revoke(certs, ["agent.all.a0"])
@@ -122,7 +122,7 @@ def test_an_authority_that_is_not_valid_today_signs_and_checks_nothing(
         patched.setattr(certificates, "_CA_DAYS", start_days + 10)
         authority(certs)
     with pytest.raises(StoreError, match=r"ca\.pem is good from .* not today; make an authority and all"):
-        write_kits(planned(), tmp_path, systemd_files, 7)
+        write_kits(planned(), tmp_path, 7)
     assert not list(tmp_path.glob("*.tar.gz"))
 
 
@@ -143,10 +143,10 @@ def test_no_certificate_outlives_its_authority(tmp_path: Path, monkeypatch: pyte
 def test_archives_of_machines_that_are_gone_are_removed_and_no_other_file(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    write_kits(planned(), tmp_path, systemd_files, 7)
+    write_kits(planned(), tmp_path, 7)
     (tmp_path / "mine.tar.gz").write_text("")
     assert capsys.readouterr().err == ""
-    write_kits(planned(machines=hosts("10.0.0.1", "10.0.0.2")), tmp_path, systemd_files, 7)
+    write_kits(planned(machines=hosts("10.0.0.1", "10.0.0.2")), tmp_path, 7)
     assert {path.name for path in tmp_path.glob("*.gz")} == {"m0.tar.gz", "m1.tar.gz", "mine.tar.gz"}
     assert (
         capsys.readouterr().err == f"{tmp_path / 'm2.tar.gz'}: removed, as the plan has no machine of this name\n"
@@ -156,7 +156,7 @@ def test_archives_of_machines_that_are_gone_are_removed_and_no_other_file(
 def test_no_archive_outside_of_the_folder_is_removed(tmp_path: Path) -> None:
     (tmp_path / "mine.tar.gz").write_text("")
     out = tmp_path / "kits"
-    write_kits(planned(), out, systemd_files, 7)
+    write_kits(planned(), out, 7)
     text = (out / "plan.json").read_text()
     (out / "plan.json").write_text(text.replace('"name": "m2"', '"name": "../mine"'))
     with pytest.raises(StoreError, match=r"plan\.json is no plan of `swarm deploy plan`"):
@@ -262,7 +262,7 @@ def test_the_service_is_shut_off_from_the_rest_of_the_machine(tmp_path: Path) ->
 def test_what_lies_in_the_folder_of_a_plan_before_is_read_as_one(tmp_path: Path) -> None:
     plan = planned()
     assert keepers_before(tmp_path, plan.run_id) == {}
-    write_kits(plan, tmp_path, systemd_files, 7)
+    write_kits(plan, tmp_path, 7)
     keepers = {keeper.id: host.name for host in plan.hosts for keeper in host.of("keeper")}
     assert keepers_before(tmp_path, plan.run_id) == keepers
     assert keepers_before(tmp_path, "another-run") == {}
