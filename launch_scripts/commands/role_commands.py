@@ -131,15 +131,13 @@ def run_role(
     from swarm.runtime.role_setup import RoleSetup
 
     log, is_router = logging.getLogger(__name__), role == "router"
+    given = run_options.find_scenario(part.scenario)
     scenario = run_options.with_network(
-        run_options.find_scenario(part.scenario),
-        connect=None if is_router else part.connect,
-        listen=listen,
-        namespace=part.namespace,
-        tls=part.tls(),
+        given, connect=part.connect, listen=listen, namespace=part.namespace, tls=part.tls()
     )
-    if is_router and part.connect is not None:
-        network = msgspec.structs.replace(scenario.network, peers=(*scenario.network.peers, part.connect))
+    if is_router and part.connect is not None:  # to another router
+        was = given.network
+        network = msgspec.structs.replace(scenario.network, connect=was.connect, peers=(*was.peers, part.connect))
         scenario = msgspec.structs.replace(scenario, network=network)
     added = None if joins is None else added_agent(scenario, id, *joins)
     if TABLE[role].any_id or joins is not None:
