@@ -134,10 +134,15 @@ def export(store: Store, out: Path, force: Force = False) -> None:
         own = sum(len(each.kinds) for each in marks if each.tile > grid.tiles)
         more = f"; without {number_of(own, 'mark')} for one class alone, which .json has" if own else ""
         marks = [each for each in marks if each.tile < grid.tiles]
+        pace, kind, _ = to_cells(grid, sets, time.time_ns())
         if ending in TIFF:
-            _write_tiff(out, terrain, grid, sets)
+            said = np.where(kind == NOTHING_SAID_BAND, np.float32(np.nan), kind.astype(np.float32))
+            bands = [
+                "pace of marks, s/m; inf lethal; nan as the prior map says",
+                "kind: 0 pace, 1 lethal, 2 clear; nan nothing said",
+            ]
+            write_raster(out, [pace, said], grid, descriptions=bands, tags={"terrain": terrain}, nodata=np.nan)
         else:
-            pace, kind, _ = to_cells(grid, sets, time.time_ns())
             write_layers(out, [mark_layer(grid, kind, pace)], MapFrame(grid))
     many = sum(len(each.kinds) for each in marks)
     print(f"{out}: {number_of(many, 'mark')} in {number_of(len(marks), 'set')}{more}")
@@ -175,16 +180,6 @@ def factors(where: Where, store: Annotated[Path | None, typer.Argument()] = None
         table.add_row(each.kind, f"{each.cells:,}", f"{each.authors}", f"{each.measured:.2f}", error, factor)
     Console(highlight=False).print(table)
     print("factor -: not yet 4.5 standard errors from 1, so the prior holds")
-
-
-def _write_tiff(out: Path, terrain: str, grid: GridSpec, sets: list[MarkSet]) -> None:
-    pace, kind, _ = to_cells(grid, sets, time.time_ns())
-    said = np.where(kind == NOTHING_SAID_BAND, np.float32(np.nan), kind.astype(np.float32))
-    bands = [
-        "pace of marks, s/m; inf lethal; nan as the prior map says",
-        "kind: 0 pace, 1 lethal, 2 clear; nan nothing said",
-    ]
-    write_raster(out, [pace, said], grid, descriptions=bands, tags={"terrain": terrain}, nodata=np.nan)
 
 
 def to_json(terrain: str, grid: GridSpec, sets: Iterable[MarkSet], classes: Sequence[str] = ()) -> str:

@@ -108,9 +108,25 @@ class Tls:
     tls_key: str | None = None
 
     def tls(self) -> TlsConfig | None:
-        from launch_scripts.launcher.run_options import tls_of
+        """The three files; without their options those in the folder. Raises ConfigError."""
+        from swarm.config.scenario import TlsConfig
 
-        return tls_of(self.tls_ca, self.tls_cert, self.tls_key, self.tls_dir)
+        folder, ca, certificate, key = self.tls_dir, self.tls_ca, self.tls_cert, self.tls_key
+        if ca is certificate is key is None:
+            if folder is None:
+                return None
+            if not Path(folder, "ca.pem").is_file():
+                raise ConfigError(f"--tls-dir: no file ca.pem in {folder}, which `swarm deploy certs` writes")
+            keys = [each for each in Path(folder).glob("*.key") if each.stem != "ca"]
+            own = keys[0] if len(keys) == 1 else None  # of many, a process finds its own by name
+            certificate, key = (folder, folder) if own is None else (str(own.with_suffix(".pem")), str(own))
+            return TlsConfig(ca=f"{folder}/ca.pem", certificate=certificate, key=key)
+        if ca is None or certificate is None or key is None:
+            raise ConfigError("--tls-ca, --tls-cert and --tls-key belong together: give all three")
+        for option, file in (("--tls-ca", ca), ("--tls-cert", certificate), ("--tls-key", key)):
+            if not Path(file).is_file() and (file == ca or not Path(file).is_dir()):
+                raise ConfigError(f"{option}: no file {file}")
+        return TlsConfig(ca=ca, certificate=certificate, key=key)
 
 
 # --- the running swarm that a command asks ----------------------------------------------------------------------

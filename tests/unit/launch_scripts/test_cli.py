@@ -15,6 +15,7 @@ from support.command import Swarm
 from support.makers import route_reply, run_info
 
 from launch_scripts import ports
+from launch_scripts.commands.shared_options import Tls
 from launch_scripts.commands.swarm_route import Answer, as_json, show, write
 from launch_scripts.launcher import run_options
 from launch_scripts.observe.run_folders import begin_run, run_facts
@@ -49,9 +50,9 @@ def test_a_folder_stands_for_the_three_files_of_tls(tmp_path: Path) -> None:
     for file in files:
         file.write_text("")
     (ca, _, certificate, key) = map(str, files)
-    assert run_options.tls_of(None, None, None, str(tmp_path)) == TlsConfig(ca=ca, certificate=certificate, key=key)
+    assert Tls(tls_dir=str(tmp_path)).tls() == TlsConfig(ca=ca, certificate=certificate, key=key)
     (tmp_path / "planner.t0.key").write_text("")  # of several, each process finds its own
-    own = run_options.tls_of(None, None, None, str(tmp_path))
+    own = Tls(tls_dir=str(tmp_path)).tls()
     assert own == TlsConfig(ca=ca, certificate=str(tmp_path), key=str(tmp_path))
 
 

@@ -10,9 +10,10 @@ from cryptography import x509
 from typer.testing import CliRunner, Result
 
 from launch_scripts.commands.deploy_commands import app
+from launch_scripts.commands.shared_options import Tls
 from launch_scripts.deploy import certificates
 from launch_scripts.deploy.certificates import THIS_MACHINE, called_of, check_signed, hosts_of
-from launch_scripts.launcher.run_options import as_process, tls_of
+from launch_scripts.launcher.run_options import as_process
 from launch_scripts.process_table import LAUNCHER, certificate_names, processes_of
 from swarm.config.toml_files import load_scenario
 from swarm.errors import ConfigError
@@ -49,7 +50,7 @@ def test_every_process_of_a_scenario_gets_a_certificate_and_finds_its_own(tmp_pa
     assert [str(host.value) for host in hosts] == ["10.0.0.1", "localhost", "127.0.0.1"]
     assert not router.extensions.get_extension_for_class(x509.BasicConstraints).value.ca
     assert 364 <= (router.not_valid_after_utc - datetime.datetime.now(datetime.UTC)).days <= 365
-    files = tls_of(str(certs / "ca.pem"), str(certs), str(certs))
+    files = Tls(None, str(certs / "ca.pem"), str(certs), str(certs)).tls()
     scenario.write_text(
         scenario.read_text() + f'tls = {{ca = "{files.ca}", certificate = "certs", key = "certs"}}\n'
     )
