@@ -20,7 +20,7 @@ from launch_scripts.simulation.world.walks import TrueTerrain
 from shared_map.array_files import Bools, Floats
 from shared_map.importers.terrain_sources import FILE_KINDS, is_terrain
 from shared_map.terrain.map_frame import MapFrame
-from shared_map.terrain.pace_layers import inflate, inflation_halves
+from shared_map.terrain.pace_layers import inflate, inflation_halves, nearest_open
 from shared_map.terrain.row_bands import counted
 from shared_map.terrain.terrain import Terrain, build_terrain
 from shared_map.terrain.true_ground import build_truth
@@ -301,12 +301,8 @@ def _start(
 
 def _near(closed: Bools, place: tuple[int, int]) -> str:
     """Returns the nearest open cell."""
-    free = np.flatnonzero(~closed)
-    if not len(free):
-        return ""
-    rows, cols = np.divmod(free, closed.shape[1])
-    best = int(np.argmin((rows - place[0]) ** 2 + (cols - place[1]) ** 2))
-    return f"; the nearest cell that will do is [{rows[best]}, {cols[best]}]"
+    near = nearest_open(~closed, *place)
+    return "" if near is None else f"; the nearest cell that will do is {list(near)}"
 
 
 # --- `swarm check`: all of it ----------------------------------------------------------------------------------

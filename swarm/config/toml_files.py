@@ -76,15 +76,15 @@ class Reading(NamedTuple):
 
 
 def _concerns(key: str, doubtful: str) -> bool:
-    for other in (doubtful, re.sub(r"\[\d+\]", "", doubtful)):
-        ours, others = key.split("."), other.split(".")
-        common = min(len(ours), len(others)) - 1
-        same = ours[common] == others[common] or (
-            others[common:-1] == [] and nearest(others[common], [ours[common]])
-        )
-        if ours[:common] == others[:common] and same:
-            return True
-    return False
+    ours, others = key.split("."), doubtful.split(".")
+    *above, (own, other) = zip(ours, others, strict=False)
+    # Only the last step of a key may be another spelling: those above it were read.
+    spelt = len(others) <= len(ours) and bool(nearest(other, [own]))
+    return (spelt or _is_of(own, other)) and all(_is_of(*each) for each in above)
+
+
+def _is_of(own: str, other: str) -> bool:
+    return own in (other, other.partition("[")[0])
 
 
 def parse_scenario(
