@@ -3,8 +3,6 @@
 import csv
 import json
 import socket
-import subprocess
-import sys
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -37,11 +35,6 @@ def test_the_version_is_the_packages_with_the_commit_of_a_checkout_as_in_a_run(
     assert (code, errors, said.partition("+")[0].strip()) == (0, "", f"swarm {version('terrain-swarm')}")
     begin_run(tmp_path, run_options.find_scenario("jacksboro"), "run")
     assert said == f"swarm {run_facts(tmp_path)['versions']['terrain_swarm']}\n"
-
-
-def test_help_is_quick_because_it_imports_neither_zenoh_nor_numpy() -> None:
-    program = "import launch_scripts.cli, sys; sys.exit('zenoh' in sys.modules or 'numpy' in sys.modules)"
-    subprocess.run([sys.executable, "-c", program], check=True)
 
 
 def test_a_folder_stands_for_the_three_files_of_tls(tmp_path: Path) -> None:
