@@ -95,14 +95,6 @@ def _sections() -> list[type[typing.Any]]:
     return [each for module in modules for each in module.values() if isinstance(each, type(Scenario))]
 
 
-def test_nothing_is_written_over(tmp_path: Path, swarm: Swarm) -> None:
-    (tmp_path / "my.toml").write_text("seed = 5\n")
-    assert swarm("new my.toml")[0] == 2
-    assert (tmp_path / "my.toml").read_text() == "seed = 5\n"
-    assert swarm("new other.toml --walk fly")[0] == 2
-    assert not (tmp_path / "other.toml").exists()
-
-
 FEW = settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 
 
