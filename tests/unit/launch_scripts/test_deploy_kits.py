@@ -11,9 +11,8 @@ from pathlib import Path
 
 import pytest
 import yaml
-from typer.testing import CliRunner
+from support.command import Swarm
 
-from launch_scripts.commands.deploy_commands import app
 from launch_scripts.deploy import certificates
 from launch_scripts.deploy.certificates import authority, called_of, check_signed, ends_on, hosts_of, issue
 from launch_scripts.deploy.machine_archives import UNIT, keep_plan, keepers_before, systemd_files, write_kits
@@ -273,17 +272,17 @@ def test_what_lies_in_the_folder_of_a_plan_before_is_read_as_one(tmp_path: Path)
         keepers_before(tmp_path, plan.run_id)
 
 
-def test_a_machine_of_containers_has_all_that_its_compose_file_names_and_no_launchers_key(tmp_path: Path) -> None:
+def test_a_machine_of_containers_has_all_that_its_compose_file_names_and_no_launchers_key(
+    tmp_path: Path, swarm: Swarm
+) -> None:
     lay_ground(tmp_path)
     (tmp_path / "small.toml").write_text(ON_GROUND)
     machines = (f'[[hosts]]\nname = "{name}"\naddress = "10.0.0.{n}"\n' for n, name in enumerate(("base", "north")))
     (tmp_path / "hosts.toml").write_text("".join(machines))
     (tmp_path / "swarm.whl").write_bytes(b"")
-    line = f"plan {tmp_path}/small.toml --hosts {tmp_path}/hosts.toml --out {tmp_path}/kits --kit compose"
-    done = CliRunner().invoke(app, [*line.split(), "--wheel", f"{tmp_path}/swarm.whl"])
-    assert "--wheel: found" in str(done.exception), "containers have an image"
-    done = CliRunner().invoke(app, line.split())
-    assert done.exit_code == 0, done.output
+    line = f"deploy plan {tmp_path}/small.toml --hosts {tmp_path}/hosts.toml --out {tmp_path}/kits --kit compose"
+    assert "--wheel: found" in swarm(f"{line} --wheel {tmp_path}/swarm.whl")[2], "containers have an image"
+    assert swarm(line)[0] == 0
     for host in ("base", "north"):
         with tarfile.open(tmp_path / "kits" / f"{host}.tar.gz") as archive:
             archive.extractall(tmp_path, filter="data")
