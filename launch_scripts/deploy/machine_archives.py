@@ -195,7 +195,7 @@ def zenohd_config(network: NetworkConfig, plugins: str | None = None) -> dict[st
 
 
 KitName = Literal["systemd", "compose"]
-"""What starts a machine's processes: the launcher as a service of systemd, or containers."""
+"""Manager of a machine's processes: systemd, whose service is the launcher, or a container engine."""
 GROUND, CERTIFICATES, PLUGINS = "ground", "certs", "plugins"
 """Folders beside a machine's scenario."""
 _BESIDE = (".dbf", ".shx", ".prj", ".cpg", ".hdr", ".tfw", ".pgw", ".wld", ".blw", ".aux.xml", ".msk")
