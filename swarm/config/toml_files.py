@@ -228,24 +228,24 @@ def _faults(scenario: Scenario) -> Iterator[Fault]:
     rovers = (id for rover in scenario.rovers for id in ids_of(rover))
     classes, groups = (each.name for each in scenario.classes), (each.name for each in scenario.groups)
     for what, names in {"targets": ids, "rovers": rovers, "classes": classes, "groups": groups}.items():
-        yield from (((f"{what}.name", f"{what}.count"), each) for each in doubled(names, what))
+        yield from _about(doubled(names, what), f"{what}.name", f"{what}.count")
     for id in ids:
         if split_rank(id)[1]:  # planner and standby of two targets would share an id
             yield named, f"targets: {id!r} is what a standby of another target is called; rename it"
     for key, section in (("cost", scenario.cost), ("terrain.hidden", scenario.terrain.hidden)):
         for n, zone in enumerate(section.zones):
             where = f"{key}.zones[{n}]"
-            yield from (((where,), each) for each in complaint(_check_zone, zone, where))
-    places = {f"targets[{n}].start": [target.start] for n, target in enumerate(scenario.targets) if target.start}
-    places |= {f"groups[{n}].cells": list(group.cells) for n, group in enumerate(scenario.groups)}
-    yield from (
-        ((key,), each)
-        for key, given in places.items()
-        for place in given
-        for each in complaint(read_place, place, key)
-    )
+            yield from _about(complaint(_check_zone, zone, where), where)
+    for n, target in enumerate(scenario.targets):
+        if target.start is not None:
+            key = f"targets[{n}].start"
+            yield from _about(complaint(read_place, target.start, key), key)
+    for n, group in enumerate(scenario.groups):
+        key = f"groups[{n}].cells"
+        for place in group.cells:
+            yield from _about(complaint(read_place, place, key), key)
     for plugin in plugins_of(scenario):
-        yield from (((plugin.key,), each) for each in complaint(check_name, plugin))
+        yield from _about(complaint(check_name, plugin), plugin.key)
     yield from cost_faults(scenario.cost, "cost")
     aloft = [f"class {name}, which flies" for name in aloft_classes(scenario)]
     climbs = ["cost.directional = true"] * scenario.cost.directional + aloft
@@ -261,8 +261,12 @@ def _faults(scenario: Scenario) -> Iterator[Fault]:
     has_tls = scenario.network.tls is not None
     for key in ("listen", "connect", "peers"):
         for endpoint in getattr(scenario.network, key):
-            found = complaint(check_endpoint, endpoint, has_tls, f"network.{key}")
-            yield from (((f"network.{key}", "network.tls"), each) for each in found)
+            where = f"network.{key}"
+            yield from _about(complaint(check_endpoint, endpoint, has_tls, where), where, "network.tls")
+
+
+def _about(faults: Iterator[str], *keys: str) -> Iterator[Fault]:
+    return ((keys, each) for each in faults)
 
 
 def _group_faults(scenario: Scenario) -> Iterator[Fault]:
