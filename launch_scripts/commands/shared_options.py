@@ -26,8 +26,6 @@ if TYPE_CHECKING:
 
 MOST_SECONDS = 1e12
 """Bound of a duration, as in a scenario."""
-MOST_SEED = 2**53
-"""Bound of a seed, as in a scenario."""
 HIGHEST_PORT = 65535
 """Ports of TCP are numbers of 16 bits."""
 
@@ -50,7 +48,7 @@ def duration(*names: str, least_s: float, most_s: float = MOST_SECONDS) -> Any:
 
 
 Seconds = Annotated[float | None, duration(least_s=0.1)]
-Seed = Annotated[int | None, typer.Option(min=0, max=MOST_SEED)]
+Seed = Annotated[int | None, typer.Option(min=0, max=2**53)]  # as in a scenario
 VehicleClass = Annotated[str, typer.Option("--class")]
 ScenarioArgument = Annotated[
     str,

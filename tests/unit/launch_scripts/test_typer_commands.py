@@ -178,13 +178,7 @@ def test_doctor_says_how_everything_is(tmp_path: Path, monkeypatch: pytest.Monke
     [
         ("packages", "version_of", lambda package: None, "failure", "numba is missing, expected >=0.63 (planner)"),
         ("packages", "version_of", lambda package: "0.1", "failure", "eclipse-zenoh is 0.1, expected "),
-        (
-            "packages",
-            "version_of",
-            without("cryptography"),
-            "failure",
-            "cryptography is missing, expected >=44 (roles)",
-        ),
+        ("packages", "version_of", without("cryptography"), "failure", "graphy is missing, expected >=44 (roles)"),
         ("packages", "version_of", without(*ROLES, "rerun-sdk"), "ok", "; not installed: the extras roles, view ("),
         ("cores", "os.sched_getaffinity", lambda pid: {0}, "warning", "1: processes take turns"),
         ("cores", "os.getloadavg", lambda: (99.0, 1.0, 1.0), "warning", "load of 99.0"),
@@ -204,8 +198,7 @@ def test_what_doctor_finds_says_what_to_do(
     tmp_path: Path,
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    owner, _, name = replaced.rpartition(".")
-    monkeypatch.setattr(getattr(machine, owner) if owner else machine, name, value)
+    monkeypatch.setattr(f"{machine.__name__}.{replaced}", value)
     found, text = machine.CHECKS[about](tmp_path)
     assert found == level
     assert words in text
