@@ -18,7 +18,7 @@ from launch_scripts.deploy import certificates, machines_needed
 from launch_scripts.deploy import machine_archives as archives
 from launch_scripts.deploy.machine_plan import Plan, load_hosts, make_plan, plan_fields
 from launch_scripts.launcher.console import columns
-from launch_scripts.launcher.run_options import common_run_id, find_scenario, own_certificate, with_network
+from launch_scripts.launcher.run_options import common_run_id, find_scenario, own_certificate, with_options
 from launch_scripts.plain_text import number_of
 from launch_scripts.process_table import ROLES, admitting_all, certificate_names
 from launch_scripts.report.gis_formats import check_target
@@ -71,7 +71,8 @@ def plan(
     """
     from launch_scripts.check.scenario_check import check_start  # `revoke` does not wait for it
 
-    chosen = with_network(find_scenario(scenario), namespace=namespace)
+    given = find_scenario(scenario)
+    chosen = msgspec.structs.replace(given, network=with_options(given.network, namespace=namespace))
     try:
         run_id = common_run_id(chosen)
         keepers = {} if out is None else archives.keepers_before(out, run_id)
@@ -277,7 +278,7 @@ def zenohd(
     if scenario is None and tls.tls_ca is not None:
         raise ConfigError("certificates are for access control, by the names of a scenario's processes: --scenario")
     chosen = Scenario() if scenario is None else admitting_all(find_scenario(scenario))
-    network = with_network(chosen, namespace=namespace, tls=tls.tls()).network
+    network = with_options(chosen.network, namespace=namespace, tls=tls.tls())
     for option, endpoints in (("--listen", listen), ("--peer", peer)):
         for endpoint in endpoints or ():
             check_endpoint(endpoint, network.tls is not None, option)

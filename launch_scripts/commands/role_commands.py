@@ -132,13 +132,13 @@ def run_role(
 
     log, is_router = logging.getLogger(__name__), role == "router"
     given = run_options.find_scenario(part.scenario)
-    scenario = run_options.with_network(
-        given, connect=part.connect, listen=listen, namespace=part.namespace, tls=part.tls()
+    network = run_options.with_options(
+        given.network, connect=part.connect, listen=listen, namespace=part.namespace, tls=part.tls()
     )
     if is_router and part.connect is not None:  # to another router
-        was = given.network
-        network = msgspec.structs.replace(scenario.network, connect=was.connect, peers=(*was.peers, part.connect))
-        scenario = msgspec.structs.replace(scenario, network=network)
+        peers = (*network.peers, part.connect)
+        network = msgspec.structs.replace(network, connect=given.network.connect, peers=peers)
+    scenario = msgspec.structs.replace(given, network=network)
     added = None if joins is None else added_agent(scenario, id, *joins)
     if TABLE[role].any_id or joins is not None:
         check_name("--id", id)

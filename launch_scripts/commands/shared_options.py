@@ -170,18 +170,12 @@ class Where(Tls):
     def network(self) -> NetworkConfig:
         """Returns the connection of this command to the swarm. Raises BusError if none runs here, ConfigError for a
         wrong option."""
-        from launch_scripts.launcher.run_options import as_process, with_network
-        from launch_scripts.process_table import LAUNCHER
-        from swarm.config.scenario import Scenario
+        from launch_scripts.launcher.run_options import own_certificate, with_options
+        from launch_scripts.process_table import OPERATOR
 
-        chosen = with_network(
-            msgspec.structs.replace(Scenario(), network=self._found),
-            connect=self.connect,
-            namespace=self.namespace,
-            tls=self.tls(),
-        )
-        network = as_process(chosen, LAUNCHER, "0").network
-        return msgspec.structs.replace(network, connect_timeout_s=_CONNECT_S)
+        network = with_options(self._found, connect=self.connect, namespace=self.namespace, tls=self.tls())
+        tls = own_certificate(network.tls, OPERATOR)
+        return msgspec.structs.replace(network, tls=tls, connect_timeout_s=_CONNECT_S)
 
     def bus(self) -> ZenohBus:
         """A session with the swarm; closed by `with`."""

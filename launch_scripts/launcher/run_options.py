@@ -77,20 +77,20 @@ def scenario_path(name: str) -> Path:
     )
 
 
-def with_network(
-    scenario: Scenario,
+def with_options(
+    network: NetworkConfig,
     *,
     connect: str | None = None,
     listen: str | None = None,
     also_listen: str | None = None,
     namespace: str | None = None,
     tls: TlsConfig | None = None,
-) -> Scenario:
-    """The scenario with other endpoints. Raises ConfigError where they would leave the machine unencrypted.
+) -> NetworkConfig:
+    """A network with what the options of a command change. Raises ConfigError where endpoints would leave the
+    machine unencrypted.
 
-    also_listen  an endpoint of the router beside those of the scenario
+    also_listen  an endpoint of the router beside those that it has
     """
-    network = scenario.network
     tls = tls or network.tls
     changes: dict[str, object] = {"tls": tls}
     given = (("connect", connect, ()), ("listen", listen, ()), ("listen", also_listen, network.listen))
@@ -101,7 +101,7 @@ def with_network(
     if namespace is not None:
         changes["namespace"] = namespace
     raw = {**msgspec.to_builtins(network), **msgspec.to_builtins(changes)}
-    return msgspec.structs.replace(scenario, network=converted(raw, NetworkConfig, "network"))
+    return converted(raw, NetworkConfig, "network")
 
 
 def as_process(scenario: Scenario, role: str, id: str) -> Scenario:
