@@ -60,8 +60,7 @@ class Root(TyperGroup):
     def format_help(self, ctx: Any, formatter: Any) -> None:
         """Prints the text above, with the names of all other commands, unless `swarm help --all` is asked for."""
         if self.all:
-            typer_commands.shorten_types(self, ctx)
-            super().format_help(ctx, formatter)
+            TyperGroup.format_help(typer_commands.with_short_types(self, ctx), ctx, formatter)
             return
         text = inspect.cleandoc(Root.__doc__ or "")
         others = ", ".join(name for name in self.commands if f"\n  {name} " not in text)

@@ -27,12 +27,13 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Annotated, Any, TypeVar, get_type_hints
 
+import msgspec
 import typer
 from typer.core import TyperCommand, TyperGroup
 from typer.exceptions import TyperException
 
 from launch_scripts.plain_text import plain
-from swarm.config.explain import choice, meanings, nearest
+from swarm.config.explain import bounds_of, choice, meanings, nearest
 from swarm.config.input_files import quoted
 from swarm.errors import EXTRAS, ConfigError, StoreError, SwarmError, missing
 from swarm.files import discard_output
@@ -79,20 +80,29 @@ class Command(TyperCommand):
     """A command whose help has short types."""
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
-        shorten_types(self, ctx)
-        super().format_help(ctx, formatter)
+        TyperCommand.format_help(with_short_types(self, ctx), ctx, formatter)
 
 
-def shorten_types(command: Any, ctx: Any) -> None:
-    """Leaves bounds and the type of flags out of a command's help: at 80 columns they break words and press the
-    meanings together. The sentence about a wrong number names its bounds, as does the reference page."""
+_NUMBERS = {int: "INTEGER", float: "NUMBER"}
+
+
+def with_short_types(command: Any, ctx: Any) -> Any:
+    """A copy of a command for its help: the bounds of a number stand in words behind its meaning, and a flag has no
+    type. In the column of types, where Typer has both, they would break words at 80 columns."""
     from typer import rich_utils
 
     rich_utils.RANGE_STRING = ""
-    for each in command.get_params(ctx):
+    shown = copy(command)
+    shown.params = [copy(each) for each in command.params]
+    for each in shown.get_params(ctx):
+        if said := ", ".join(bounds_of(msgspec.Meta(ge=each.min, le=each.max))):
+            each.help = f"{each.help} \\[{said}]"
         if each.param_type_name == "option":
-            shown = re.sub(r" range|list\[|\]", "", each.display_type(ctx))
-            each.metavar = "" if each.is_flag else each.metavar or shown
+            usual = _NUMBERS.get(each.type_descriptor.annotation) or re.sub(
+                r"list\[|\]", "", each.display_type(ctx)
+            )
+            each.metavar = "" if each.is_flag else each.metavar or usual
+    return shown
 
 
 def family_app(help: str) -> typer.Typer:
@@ -183,8 +193,7 @@ class Family(TyperGroup):
         """Typer gives a new group the commands that it knows, and of a family it knows none."""
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
-        shorten_types(self.group, ctx)
-        self.group.format_help(ctx, formatter)
+        with_short_types(self.group, ctx).format_help(ctx, formatter)
 
 
 # --- completion: nothing here may fail or take long, as the user has pressed the Tab key ------------------------

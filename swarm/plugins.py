@@ -221,7 +221,7 @@ def _reach(folder: str) -> None:
 
 def _imported(named: NamedPlugin, folder: str) -> Factory:
     kind, name = named.kind, named.name
-    check_name(named, "scenario")
+    check_name(named)
     module, _, attribute = name.partition(":")
     _reach(folder)
     found: object = _started(named, "could not be imported", lambda: importlib.import_module(module))

@@ -4,7 +4,7 @@ is built (whether its locations are on passable ground, and connected). `check_s
 from __future__ import annotations
 
 import random
-from collections.abc import Collection, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,7 @@ from launch_scripts.simulation.world.walks import TrueTerrain
 from shared_map.array_files import Bools, Floats
 from shared_map.importers.terrain_sources import FILE_KINDS, is_terrain
 from shared_map.terrain.map_frame import MapFrame
-from shared_map.terrain.pace_layers import inflate, inflation_halves
+from shared_map.terrain.pace_layers import inflate, inflation_halves, nearest_open
 from shared_map.terrain.row_bands import counted
 from shared_map.terrain.terrain import Terrain, build_terrain
 from shared_map.terrain.true_ground import build_truth
@@ -30,7 +30,7 @@ from swarm.config.explain import nearest
 from swarm.config.input_files import FileKind, check_file, quoted, read_text, size
 from swarm.config.plugin_names import plugins_of
 from swarm.config.scenario import Scenario, TlsConfig, plan_agents
-from swarm.config.toml_files import BUILT_IN_TERRAINS, is_loopback, read_scenario, with_files
+from swarm.config.toml_files import BUILT_IN_TERRAINS, Reading, is_loopback, read_scenario, with_files
 from swarm.config.vehicle_classes import GROUND, flies
 from swarm.errors import BusError, ConfigError, SwarmError, TerrainError
 from swarm.grid import REGION_CELLS, GridSpec
@@ -155,18 +155,17 @@ def _certificates(scenario: Scenario, tls: TlsConfig, whole: bool) -> Iterator[F
         yield failure("network.tls", f"{tls.certificate} has no certificate of {lacking[0]}{several}; {make}")
 
 
-def plugins(scenario: Scenario, roles: Collection[str] = ROLES) -> Iterator[Finding]:
+def plugins(scenario: Scenario) -> Iterator[Finding]:
     """Plug-ins that cannot be imported, or do not take their options. Runs their modules."""
     for named in plugins_of(scenario):
-        if named.kind.role in roles or named.kind.role == "any":
-            try:
-                find_plugin(named, scenario.plugin_folder)
-            except SwarmError as error:
-                yield failure(named.key, str(error).removeprefix(f"{named.key}: "))
+        try:
+            find_plugin(named, scenario.plugin_folder)
+        except SwarmError as error:
+            yield failure(named.key, str(error).removeprefix(f"{named.key}: "))
 
 
 def check_start(scenario: Scenario, *, joins: bool, has_ground: bool) -> None:
-    """The cheap half of `swarm check`, before `swarm up` starts anything. Raises SwarmError with the first failure.
+    """The cheap half of `swarm check`, before `swarm up` starts anything. Raises SwarmError with all failures.
 
     joins       the router is elsewhere
     has_ground  the terrain's files must be here; else a keeper serves the missing ones
@@ -178,9 +177,9 @@ def check_start(scenario: Scenario, *, joins: bool, has_ground: bool) -> None:
         found += files_named(scenario)
     if not joins:
         found += meets(scenario)
-    for finding in found:
-        error = TerrainError if finding.about.startswith("terrain") else ConfigError
-        raise error(f"scenario {scenario.name}: {finding.sentence}")
+    if found:
+        error = TerrainError if found[0].about.startswith("terrain") else ConfigError
+        raise error("\n".join(f"scenario {scenario.name}: {finding.sentence}" for finding in found))
 
 
 def check_places(scenario: Scenario, terrain: Terrain, truth: Floats, homes: Bools | None = None) -> None:
@@ -302,12 +301,8 @@ def _start(
 
 def _near(closed: Bools, place: tuple[int, int]) -> str:
     """Returns the nearest open cell."""
-    free = np.flatnonzero(~closed)
-    if not len(free):
-        return ""
-    rows, cols = np.divmod(free, closed.shape[1])
-    best = int(np.argmin((rows - place[0]) ** 2 + (cols - place[1]) ** 2))
-    return f"; the nearest usable cell is [{rows[best]}, {cols[best]}]"
+    near = nearest_open(~closed, *place)
+    return "" if near is None else f"; the nearest usable cell is {list(near)}"
 
 
 # --- `swarm check`: all of it ----------------------------------------------------------------------------------
@@ -315,15 +310,15 @@ def _near(closed: Bools, place: tuple[int, int]) -> str:
 
 def check_scenario(path: Path, runs: Path, port: int | None) -> tuple[list[Finding], dict[str, Any], str]:
     """Returns the findings, failures first, and the facts of a scenario whose ground was built, also in words."""
-    read, faults = read_scenario(read_text(path, FileKind.SCENARIO), str(path), path.parent)
-    found = [failure("", fault) for fault in faults]
+    read = read_scenario(read_text(path, FileKind.SCENARIO), str(path), path.parent)
+    found = [failure("", fault) for fault in read.faults]
     facts: dict[str, Any] = {}
-    if read is not None:
+    if read.scenario is not None:
         if port is not None:
-            read = with_port(read, port)
+            read = read._replace(scenario=with_port(read.scenario, port))
         found += [
             finding._replace(about=f"{path}: {finding.about}" if finding.about else str(path))
-            for finding in (_findings(read, runs, facts) if not faults else files_named(read))
+            for finding in _findings(read, runs, facts)
         ]
     found.sort(key=lambda finding: finding.level != "failure")  # failures stand before warnings
     if not facts:
@@ -338,18 +333,29 @@ def check_scenario(path: Path, runs: Path, port: int | None) -> tuple[list[Findi
     return found, facts, summary
 
 
-def _findings(scenario: Scenario, runs: Path, facts: dict[str, Any]) -> Iterator[Finding]:
-    """facts  collects facts on the way"""
-    yield from network(scenario)
-    yield from meets(scenario)
-    yield from plugins(scenario)
-    try:
-        check_ports(scenario, ROLES)
-    except SwarmError as error:  # a port which is taken may be free when the run starts
-        yield (warning if isinstance(error, BusError) else failure)("", str(error))
-    broken = [*files_named(scenario), *places_counted(scenario)]
+def _findings(read: Reading, runs: Path, facts: dict[str, Any]) -> Iterator[Finding]:
+    """Yields what can be known of a scenario, which may have faults: then its terrain is not built.
+
+    facts  collects facts on the way
+    """
+    scenario = read.scenario
+    assert scenario is not None
+    if read.knows("network", "monitor.follow", "targets", "groups", "vehicles.per_agent"):
+        yield from network(scenario)
+    if read.knows("network.listen", "network.connect"):
+        yield from meets(scenario)
+    yield from (each for each in plugins(scenario) if read.knows(each.about, "plugin_folder"))
+    if read.knows("network.listen", "monitor"):
+        try:
+            check_ports(scenario, ROLES)
+        except SwarmError as error:  # a port which is taken may be free when the run starts
+            yield (warning if isinstance(error, BusError) else failure)("", str(error))
+    broken = [
+        *files_named(scenario),
+        *(places_counted(scenario) if read.knows("groups.cells", "groups.vehicles") else ()),
+    ]
     yield from broken
-    if broken:
+    if broken or read.faults:
         return
     try:
         with progress() as tell:

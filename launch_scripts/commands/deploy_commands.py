@@ -4,9 +4,8 @@ from __future__ import annotations
 
 import json
 import re
-from functools import partial
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Annotated
 
 import msgspec
 import typer
@@ -19,7 +18,7 @@ from launch_scripts.deploy import certificates, machines_needed
 from launch_scripts.deploy import machine_archives as archives
 from launch_scripts.deploy.machine_plan import Plan, load_hosts, make_plan, plan_fields
 from launch_scripts.launcher.console import columns
-from launch_scripts.launcher.run_options import common_run_id, find_scenario, own_certificate, with_network
+from launch_scripts.launcher.run_options import common_run_id, find_scenario, own_certificate, with_options
 from launch_scripts.plain_text import number_of
 from launch_scripts.process_table import ROLES, admitting_all, certificate_names
 from launch_scripts.report.gis_formats import check_target
@@ -34,7 +33,6 @@ from swarm.errors import ConfigError
 from swarm.files import write_file
 
 app = family_app("A plan, certificates and configurations for several machines.")
-KitName = Literal["systemd", "compose"]
 Days = Annotated[int, typer.Option(min=1, max=3650)]
 _IMAGE = r"[A-Za-z0-9][A-Za-z0-9_.:/-]{0,251}:[A-Za-z0-9_][A-Za-z0-9_.-]{0,123}"
 """With a tag, which "-all" may be added to: no digest."""
@@ -47,7 +45,7 @@ def plan(
     scenario: ScenarioArgument,
     hosts: Annotated[Path, typer.Option()],
     out: Path | None = None,
-    kit: KitName = "systemd",
+    kit: archives.KitName = "systemd",
     image: str = "",
     wheel: Path | None = None,
     days: Days = 365,
@@ -73,7 +71,8 @@ def plan(
     """
     from launch_scripts.check.scenario_check import check_start  # `revoke` does not wait for it
 
-    chosen = with_network(find_scenario(scenario), namespace=namespace)
+    given = find_scenario(scenario)
+    chosen = msgspec.structs.replace(given, network=with_options(given.network, namespace=namespace))
     try:
         run_id = common_run_id(chosen)
         keepers = {} if out is None else archives.keepers_before(out, run_id)
@@ -92,7 +91,7 @@ def plan(
     if out is None and (image or wheel is not None):
         raise ConfigError("--image and --wheel need --out, whose archives hold them")
     check_start(chosen, joins=True, has_ground=True)
-    written = [] if out is None else _write(made, out, kit, image, days, wheel)
+    written = [] if out is None else archives.write_kits(made, out, days, kit, image=image, wheel=wheel)
     if as_json:
         typer.echo(json.dumps({**plan_fields(made), "archives": list(map(str, written))}, indent=2))
         return
@@ -103,16 +102,7 @@ def plan(
         typer.echo(f"{out / 'certs'}: operator.0 for your own commands, and the authority; keep ca.key to yourself")
 
 
-def _write(made: Plan, out: Path, kit: KitName, image: str, days: int, wheel: Path | None) -> list[Path]:
-    if kit == "systemd":
-        return archives.write_kits(made, out, archives.systemd_files, days, wheel)
-    compose = partial(
-        archives.compose_files, image=image, revoked=revocations.revoked_in(out / archives.CERTIFICATES)
-    )
-    return archives.write_kits(made, out, compose, days, launcher=False)
-
-
-def _show(made: Plan, kit: KitName) -> None:
+def _show(made: Plan, kit: archives.KitName) -> None:
     # One column a machine: names of processes are many and short, machines few.
     table = Table(box=None, padding=(0, 2, 0, 0), header_style="bold")
     table.add_column("")
@@ -233,16 +223,15 @@ def certs(
         bearer(name)
     revoked = {*chosen.network.revoked, *revocations.revoked_in(folder)}
     for name in dict.fromkeys(wanted):
-        path, again = folder / f"{name}.pem", renew
+        path, called = folder / f"{name}.pem", common_name(name, revoked)
         hosts = [host for host in given.get(name, "").split(",") if host]
         if bearer(name).role == ROUTER:
             hosts += certificates.THIS_MACHINE
-        if name not in given and (again := path.exists()):
-            if certificates.may_stay(path, (), certificates.called_of(path)):
+        if name not in given and path.exists():
+            if certificates.may_stay(path, (), called):
                 continue
             hosts = sorted(certificates.hosts_of(path))
-        called = common_name(name, revoked)
-        certificates.issue(folder, name, hosts, days, renew=again, called=called)
+        certificates.issue(folder, name, hosts, days, renew=renew or name not in given, called=called)
         print(f"{path}, {path.with_suffix('.key')}: {called}, good until {certificates.ends_on(path)}")
     print(f"authority: {folder / 'ca.pem'}; keep {folder / 'ca.key'} to yourself")
 
@@ -289,7 +278,7 @@ def zenohd(
     if scenario is None and tls.tls_ca is not None:
         raise ConfigError("certificates are for access control, by the names of a scenario's processes: --scenario")
     chosen = Scenario() if scenario is None else admitting_all(find_scenario(scenario))
-    network = with_network(chosen, namespace=namespace, tls=tls.tls()).network
+    network = with_options(chosen.network, namespace=namespace, tls=tls.tls())
     for option, endpoints in (("--listen", listen), ("--peer", peer)):
         for endpoint in endpoints or ():
             check_endpoint(endpoint, network.tls is not None, option)

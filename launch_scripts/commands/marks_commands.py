@@ -63,7 +63,7 @@ def show(store: Store, as_json: AsJson = False) -> None:
     """
     terrain, grid, held = _read(store)
     sets, words = _parted(grid, held)
-    _, kind, _ = to_cells(grid, sets, time.time_ns())
+    _, kind = to_cells(grid, sets, time.time_ns())
     with KeeperStore(store, read_only=True) as kept:
         seen = kept.sightings()
     frame = MapFrame(grid)
@@ -134,10 +134,15 @@ def export(store: Store, out: Path, force: Force = False) -> None:
         own = sum(len(each.kinds) for each in marks if each.tile > grid.tiles)
         more = f"; without {number_of(own, 'mark')} for one class alone, which .json has" if own else ""
         marks = [each for each in marks if each.tile < grid.tiles]
+        pace, kind = to_cells(grid, sets, time.time_ns())
         if ending in TIFF:
-            _write_tiff(out, terrain, grid, sets)
+            said = np.where(kind == NOTHING_SAID_BAND, np.float32(np.nan), kind.astype(np.float32))
+            bands = [
+                "pace of marks, s/m; inf lethal; nan as the prior map says",
+                "kind: 0 pace, 1 lethal, 2 clear; nan nothing said",
+            ]
+            write_raster(out, [pace, said], grid, descriptions=bands, tags={"terrain": terrain}, nodata=np.nan)
         else:
-            pace, kind, _ = to_cells(grid, sets, time.time_ns())
             write_layers(out, [mark_layer(grid, kind, pace)], MapFrame(grid))
     many = sum(len(each.kinds) for each in marks)
     print(f"{out}: {number_of(many, 'mark')} in {number_of(len(marks), 'set')}{more}")
@@ -175,16 +180,6 @@ def factors(where: Where, store: Annotated[Path | None, typer.Argument()] = None
         table.add_row(each.kind, f"{each.cells:,}", f"{each.authors}", f"{each.measured:.2f}", error, factor)
     Console(highlight=False).print(table)
     print("factor -: not yet 4.5 standard errors from 1, so the prior holds")
-
-
-def _write_tiff(out: Path, terrain: str, grid: GridSpec, sets: list[MarkSet]) -> None:
-    pace, kind, _ = to_cells(grid, sets, time.time_ns())
-    said = np.where(kind == NOTHING_SAID_BAND, np.float32(np.nan), kind.astype(np.float32))
-    bands = [
-        "pace of marks, s/m; inf lethal; nan as the prior map says",
-        "kind: 0 pace, 1 lethal, 2 clear; nan nothing said",
-    ]
-    write_raster(out, [pace, said], grid, descriptions=bands, tags={"terrain": terrain}, nodata=np.nan)
 
 
 def to_json(terrain: str, grid: GridSpec, sets: Iterable[MarkSet], classes: Sequence[str] = ()) -> str:
@@ -232,24 +227,19 @@ def _marks(each: MarkSet, grid: GridSpec) -> list[list[Any]]:
     return marks
 
 
-def to_cells(
-    grid: GridSpec, sets: Iterable[MarkSet], now_ns: int = 0
-) -> tuple[NDArray[np.float32], NDArray[np.uint8], NDArray[np.int64]]:
-    """(pace, kind, stamp) of the winning marks for all vehicles, (rows, cols) each. The pace is in s/m: inf is
-    lethal, nan is as the prior has it. The kind is a MarkKind, NOTHING_SAID_BAND where no author says anything. The
-    timestamp is the time of the mark: UNIX time in ns, 0 without a mark."""
+def to_cells(grid: GridSpec, sets: Iterable[MarkSet], now_ns: int) -> tuple[NDArray[np.float32], NDArray[np.uint8]]:
+    """(pace, kind) of the winning marks for all vehicles, (rows, cols) each. The pace is in s/m: inf is lethal, nan
+    is as the prior has it. The kind is a MarkKind, NOTHING_SAID_BAND where no author says anything."""
     replica = MapReplica(grid)
     replica.merge(list(sets))
     replica.tick(now_ns)
     pace = np.full(grid.cells, np.nan, np.float32)
     kind = np.full(grid.cells, NOTHING_SAID_BAND, np.uint8)
-    stamps_ns = np.zeros(grid.cells, np.int64)
     for tile in replica.held.tiles:
         if tile >= grid.tiles:  # learned factors, and marks for one class alone
             continue
         won = replica.winners(tile)
         cells = grid_cells(grid, tile_corners(grid, tile), won.cells)
-        kind[cells], stamps_ns[cells] = won.kinds, won.stamps_ns
+        kind[cells] = won.kinds
         pace[cells] = np.choose(won.kinds, [won.paces, np.float32(np.inf), np.float32(np.nan)])
-    shape = (grid.rows, grid.cols)
-    return pace.reshape(shape), kind.reshape(shape), stamps_ns.reshape(shape)
+    return pace.reshape(grid.shape), kind.reshape(grid.shape)

@@ -131,16 +131,14 @@ def run_role(
     from swarm.runtime.role_setup import RoleSetup
 
     log, is_router = logging.getLogger(__name__), role == "router"
-    scenario = run_options.with_network(
-        run_options.find_scenario(part.scenario),
-        connect=None if is_router else part.connect,
-        listen=listen,
-        namespace=part.namespace,
-        tls=part.tls(),
+    given = run_options.find_scenario(part.scenario)
+    network = run_options.with_options(
+        given.network, connect=part.connect, listen=listen, namespace=part.namespace, tls=part.tls()
     )
-    if is_router and part.connect is not None:
-        network = msgspec.structs.replace(scenario.network, peers=(*scenario.network.peers, part.connect))
-        scenario = msgspec.structs.replace(scenario, network=network)
+    if is_router and part.connect is not None:  # to another router
+        peers = (*network.peers, part.connect)
+        network = msgspec.structs.replace(network, connect=given.network.connect, peers=peers)
+    scenario = msgspec.structs.replace(given, network=network)
     added = None if joins is None else added_agent(scenario, id, *joins)
     if TABLE[role].any_id or joins is not None:
         check_name("--id", id)

@@ -141,11 +141,16 @@ def up(scenario: shared_options.ScenarioArgument, run: RunOptions, meeting: Meet
     chosen = run_options.find_scenario(scenario)
     if run.port is not None:
         chosen = run_options.with_port(chosen, run.port)
-    chosen = run_options.with_network(
-        chosen, connect=meeting.connect, also_listen=meeting.listen, namespace=meeting.namespace, tls=meeting.tls()
+    network = run_options.with_options(
+        chosen.network,
+        connect=meeting.connect,
+        also_listen=meeting.listen,
+        namespace=meeting.namespace,
+        tls=meeting.tls(),
     )
     chosen = msgspec.structs.replace(
         chosen,
+        network=network,
         seconds=chosen.seconds if run.seconds is None else run.seconds,
         seed=chosen.seed if run.seed is None else run.seed,
         monitor=msgspec.structs.replace(chosen.monitor, live=chosen.monitor.live and not run.no_live),

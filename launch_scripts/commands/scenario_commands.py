@@ -89,11 +89,10 @@ def _check(path: Path, text: str) -> None:
     from launch_scripts.check import scenario_check
     from swarm.config.toml_files import read_scenario
 
-    scenario, faults = read_scenario(text, str(path), path.parent)
-    found = (
-        faults if scenario is None else [*faults, *(each.sentence for each in scenario_check.files_named(scenario))]
-    )
-    for sentence in found:
+    scenario, faults, _ = read_scenario(text, str(path), path.parent)
+    if scenario is not None:
+        faults += [each.sentence for each in scenario_check.files_named(scenario)]
+    for sentence in faults:
         key, _, rest = sentence.removeprefix(f"{path}: ").partition(": ")
         raise ConfigError(f"{_OPTIONS.get(key, key)}: {rest}")
 

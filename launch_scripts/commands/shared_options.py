@@ -26,8 +26,6 @@ if TYPE_CHECKING:
 
 MOST_SECONDS = 1e12
 """Bound of a duration, as in a scenario."""
-MOST_SEED = 2**53
-"""Bound of a seed, as in a scenario."""
 HIGHEST_PORT = 65535
 """Ports of TCP are numbers of 16 bits."""
 
@@ -50,7 +48,7 @@ def duration(*names: str, least_s: float, most_s: float = MOST_SECONDS) -> Any:
 
 
 Seconds = Annotated[float | None, duration(least_s=0.1)]
-Seed = Annotated[int | None, typer.Option(min=0, max=MOST_SEED)]
+Seed = Annotated[int | None, typer.Option(min=0, max=2**53)]  # as in a scenario
 VehicleClass = Annotated[str, typer.Option("--class")]
 ScenarioArgument = Annotated[
     str,
@@ -108,9 +106,25 @@ class Tls:
     tls_key: str | None = None
 
     def tls(self) -> TlsConfig | None:
-        from launch_scripts.launcher.run_options import tls_of
+        """The three files; without their options those in the folder. Raises ConfigError."""
+        from swarm.config.scenario import TlsConfig
 
-        return tls_of(self.tls_ca, self.tls_cert, self.tls_key, self.tls_dir)
+        folder, ca, certificate, key = self.tls_dir, self.tls_ca, self.tls_cert, self.tls_key
+        if ca is certificate is key is None:
+            if folder is None:
+                return None
+            if not Path(folder, "ca.pem").is_file():
+                raise ConfigError(f"--tls-dir: no file ca.pem in {folder}, which `swarm deploy certs` writes")
+            keys = [each for each in Path(folder).glob("*.key") if each.stem != "ca"]
+            own = keys[0] if len(keys) == 1 else None  # of many, a process finds its own by name
+            certificate, key = (folder, folder) if own is None else (str(own.with_suffix(".pem")), str(own))
+            return TlsConfig(ca=f"{folder}/ca.pem", certificate=certificate, key=key)
+        if ca is None or certificate is None or key is None:
+            raise ConfigError("--tls-ca, --tls-cert and --tls-key belong together: give all three")
+        for option, file in (("--tls-ca", ca), ("--tls-cert", certificate), ("--tls-key", key)):
+            if not Path(file).is_file() and (file == ca or not Path(file).is_dir()):
+                raise ConfigError(f"{option}: no file {file}")
+        return TlsConfig(ca=ca, certificate=certificate, key=key)
 
 
 # --- the running swarm that a command asks ----------------------------------------------------------------------
@@ -156,18 +170,12 @@ class Where(Tls):
     def network(self) -> NetworkConfig:
         """Returns the connection of this command to the swarm. Raises BusError if none runs here, ConfigError for a
         wrong option."""
-        from launch_scripts.launcher.run_options import as_process, with_network
-        from launch_scripts.process_table import LAUNCHER
-        from swarm.config.scenario import Scenario
+        from launch_scripts.launcher.run_options import own_certificate, with_options
+        from launch_scripts.process_table import OPERATOR
 
-        chosen = with_network(
-            msgspec.structs.replace(Scenario(), network=self._found),
-            connect=self.connect,
-            namespace=self.namespace,
-            tls=self.tls(),
-        )
-        network = as_process(chosen, LAUNCHER, "0").network
-        return msgspec.structs.replace(network, connect_timeout_s=_CONNECT_S)
+        network = with_options(self._found, connect=self.connect, namespace=self.namespace, tls=self.tls())
+        tls = own_certificate(network.tls, OPERATOR)
+        return msgspec.structs.replace(network, tls=tls, connect_timeout_s=_CONNECT_S)
 
     def bus(self) -> ZenohBus:
         """A session with the swarm; closed by `with`."""

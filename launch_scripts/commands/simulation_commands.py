@@ -208,11 +208,6 @@ def run(
     workers    Processes of this machine; as many as it has cores if not given.
     out        Folder of the results; sweeps/NAME of the study if not given.
     """
-    return int(not sweep_study(study, scheduler, workers, out, as_json))
-
-
-def sweep_study(name: str, scheduler: str | None, workers: int | None, out: Path | None, as_json: bool) -> bool:
-    """Runs what a study lacks, and prints its summary. True if every trial has a result and no law broke."""
     from rich.console import Console
 
     if scheduler is not None and workers is not None:
@@ -226,7 +221,7 @@ def sweep_study(name: str, scheduler: str | None, workers: int | None, out: Path
     from launch_scripts.simulation.study import METHOD, outcome_table, study_path
     from launch_scripts.simulation.study_sweep import NUMBERS, RESULTS, Sweep
 
-    sweep = Sweep(study_path(name), out)
+    sweep = Sweep(study_path(study), out)
     console = Console(stderr=True, highlight=False, soft_wrap=True, markup=False, emoji=False)
     kept = sweep.trials - len(sweep.missing)
     if kept:
@@ -243,7 +238,7 @@ def sweep_study(name: str, scheduler: str | None, workers: int | None, out: Path
     summary = sweep.finish()
     if as_json:
         typer.echo((sweep.folder / NUMBERS).read_text(encoding="utf-8"))
-        return not summary.failing and not summary.missing
+        return int(bool(summary.failing or summary.missing))
     for name in summary.cases[0].outcomes:
         typer.echo(f"{name}\n{outcome_table(summary, name)}\n")
     for failure in summary.failing[:_SHOWN_FAILURES]:
@@ -251,7 +246,7 @@ def sweep_study(name: str, scheduler: str | None, workers: int | None, out: Path
     missing = f"; {summary.missing:,} have no result" if summary.missing else ""
     typer.echo(f"{len(summary.failing):,} of {summary.trials:,} trials broke a law{missing}")
     typer.echo(f"{METHOD}\nsummary: {sweep.folder / NUMBERS}, results: {sweep.folder / RESULTS}")
-    return not summary.failing and not summary.missing
+    return int(bool(summary.failing or summary.missing))
 
 
 def _run(sweep: Sweep, console: Console, workers: int, scheduler: str | None, stopping: Callable[[], bool]) -> None:

@@ -19,7 +19,7 @@ from launch_scripts.report import gis_formats
 from planner_service.route_finder import RouteFinder
 from shared_map.array_files import Floats
 from shared_map.terrain.map_frame import MapFrame, middles_of
-from shared_map.terrain.pace_layers import TerrainClass
+from shared_map.terrain.pace_layers import TerrainClass, nearest_open
 from shared_map.terrain.slope_and_climb import said_of_cost
 from shared_map.terrain.terrain import Terrain, build_terrain
 from swarm.config.scenario import PlannerConfig, Scenario
@@ -247,14 +247,10 @@ def _check_open(scenario: Scenario, terrain: Terrain, cell: int, option: str, ot
     grid, frame = terrain.grid, MapFrame(terrain.grid)
     kind = TerrainClass(terrain.classes.reshape(-1)[cell]).name.lower()
     seconds = terrain.pace_s_per_m if lethal[other] else finder_for(scenario, terrain, other).cost_to_go_s()
-    (row, col), (rows, cols) = grid.row_col(cell), np.nonzero(np.isfinite(seconds))
     told = f"{option} is on lethal ground, {written(frame, cell)}, class {kind}: no way leads there"
     told += f"; ground above {scenario.cost.max_slope_deg:g} degrees is lethal (--preset, cost.max_slope_deg)"
-    if len(rows):
-        near = int(np.argmin((rows - row) ** 2 + (cols - col) ** 2))
-        told += (
-            f"; the nearest place that can be reached is {written(frame, int(rows[near] * grid.cols + cols[near]))}"
-        )
+    if (near := nearest_open(np.isfinite(seconds), *grid.row_col(cell))) is not None:
+        told += f"; the nearest place that can be reached is {written(frame, grid.cell(*near))}"
     raise TerrainError(told)
 
 

@@ -17,7 +17,6 @@ from cryptography.hazmat.primitives.asymmetric import ec
 from cryptography.hazmat.primitives.asymmetric.types import PrivateKeyTypes
 from cryptography.x509.oid import ExtendedKeyUsageOID, NameOID
 
-from launch_scripts.process_table import check_name
 from swarm.config.input_files import FileKind, read_bytes
 from swarm.errors import ConfigError, StoreError
 from swarm.files import make_folder, replacing, write_file
@@ -62,21 +61,19 @@ def issue(
     name    of the files, and if `called` is None what access control knows its bearer by: keeper.0, agent.all.a0
     hosts   names and addresses under which others connect to it; none for those that only connect
     called  the common name, where it is another: agent.all.a0~2 after the first was revoked
-    Raises ConfigError on a name that cannot be one, StoreError where files cannot be written or are there already.
+    Raises ConfigError on a host that cannot be one, StoreError where files cannot be written or are there already.
     """
-    check_name("name", name)
-    if name == CA:
-        raise ConfigError(f"the name {CA} is the authority's own")
     path = folder / f"{name}.pem"
     if path.exists() and not renew:
         raise StoreError(f"{path} is there already; --renew replaces it")
+    reached = x509.SubjectAlternativeName([_general_name(host) for host in hosts or [name]])
     signer = authority(folder)
     # A certificate is refused once its authority has expired, so it promises no more than that.
     end = min(_in_days(days), signer.certificate.not_valid_after_utc)
     extensions = {
         x509.BasicConstraints(ca=False, path_length=None): True,
         x509.ExtendedKeyUsage([ExtendedKeyUsageOID.SERVER_AUTH, ExtendedKeyUsageOID.CLIENT_AUTH]): False,
-        x509.SubjectAlternativeName([_general_name(host) for host in hosts or [name]]): False,
+        reached: False,
         x509.AuthorityKeyIdentifier.from_issuer_public_key(signer.key.public_key()): False,
     }
     _make(folder, name, called or name, end, extensions, signer)

@@ -20,10 +20,10 @@ import shlex
 import sys
 import tarfile
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from functools import cache
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import msgspec
 
@@ -194,8 +194,8 @@ def zenohd_config(network: NetworkConfig, plugins: str | None = None) -> dict[st
     return config
 
 
-Render = Callable[[Plan, PlannedHost], Mapping[str, str]]
-"""Name -> text of the files that start a machine's processes. Names without an ending are scripts."""
+KitName = Literal["systemd", "compose"]
+"""Manager of a machine's processes: systemd, whose service is the launcher, or a container engine."""
 GROUND, CERTIFICATES, PLUGINS = "ground", "certs", "plugins"
 """Folders beside a machine's scenario."""
 _BESIDE = (".dbf", ".shx", ".prj", ".cpg", ".hdr", ".tfw", ".pgw", ".wld", ".blw", ".aux.xml", ".msk")
@@ -214,14 +214,16 @@ class _Before(msgspec.Struct):
 
 
 def write_kits(
-    plan: Plan, out: Path, render: Render, days: int, wheel: Path | None = None, *, launcher: bool = True
+    plan: Plan, out: Path, days: int, kit: KitName = "systemd", *, image: str = "", wheel: Path | None = None
 ) -> list[Path]:
     """An archive for each machine, `out/NAME.tar.gz`, which unpacks into `swarm-NAME/`. Returns the archives.
 
     Certificates lie in `out/certs` with the authority's key, which leaves it for no archive. Existing files are
-    kept while they are valid, so that a second plan replaces no key without need. `launcher`: whether a launcher
-    starts the processes of a machine, and needs a certificate of its own. Raises StoreError where a file cannot be
-    read or written.
+    kept while they are valid, so that a second plan replaces no key without need. Raises StoreError where a file
+    cannot be read or written.
+
+    image  of containers, see `compose_files`
+    wheel  file from which the swarm is installed
     """
     folder = out / CERTIFICATES
     revoked = revoked_in(folder)
@@ -239,15 +241,18 @@ def write_kits(
     written = []
     for host in plan.hosts:
         scenario, ground = host_scenario(plan, host)
-        texts = {"scenario.toml": scenario_text(scenario, Path()), PLAN: as_json(plan), **render(plan, host)}
+        texts = {"scenario.toml": scenario_text(scenario, Path()), PLAN: as_json(plan)}
         if revoked and host.of(ROUTER):
             texts[f"{CERTIFICATES}/{REVOKED}"] = "".join(f"{name}\n" for name in revoked)
         files = {**ground, **plugin_files(plan.scenario), f"{CERTIFICATES}/{CA}.pem": folder / f"{CA}.pem"}
         for process in host.processes:
             reached = (host.address, router_name(host), *THIS_MACHINE) if process.role == ROUTER else ()
             files |= issued(process.certificate, process.certificate, reached)
-        if launcher:
+        if kit == "systemd":
+            texts |= systemd_files(plan, host)
             files |= issued(host.operator, OPERATOR)
+        else:
+            texts |= compose_files(plan, host, image, revoked)
         if wheel is not None:
             files[f"wheels/{wheel.name}"] = wheel
         written.append(_archive(out, host.name, texts, files))

@@ -89,12 +89,10 @@ def run_child(
 
 
 def wait_for_launcher() -> None:
-    """Blocks until the launcher has ended."""
+    """Blocks until the launcher, which has started this process, has ended."""
     parent = multiprocessing.parent_process()
-    if parent is None:
-        threading.Event().wait()
-    else:
-        wait([parent.sentinel])
+    assert parent is not None
+    wait([parent.sentinel])
 
 
 def _give_way(niceness: int) -> None:

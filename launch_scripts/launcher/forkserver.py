@@ -62,15 +62,13 @@ def forking() -> Iterator[None]:
 
 
 class WarmUp:
-    """Starts the forkserver, waits on a thread until it has loaded everything, and has the kernels compiled that
-    are missing, by builders which it forks.
+    """Waits on a thread until the forkserver has loaded everything, and has the kernels compiled that are missing,
+    by builders which it forks.
 
-    loads    what the forkserver loads
-    scenario that of the planners that are to run; None if none are
+    scenario  that of the planners that are to run; None if none are
     """
 
-    def __init__(self, loads: str | None, scenario: Scenario | None = None) -> None:
-        start_forkserver(loads)
+    def __init__(self, scenario: Scenario | None) -> None:
         self._scenario = scenario
         self._context = multiprocessing.get_context("forkserver")
         self._failure: BaseException | None = None

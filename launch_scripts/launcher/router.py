@@ -230,7 +230,7 @@ class _Visitor(_End):
             return
         self._address = address
         self.transport.pause_reading()
-        self._door.keep(loop.create_task(self._join()))
+        self._joining = loop.create_task(self._join())  # kept here, as its loop does not
         loop.call_later(PROVED_AFTER_S, self._prove)
 
     async def _join(self) -> None:
@@ -298,7 +298,6 @@ class Door:
         self.places: list[tuple[str, int]] = []
         """Host and port of each socket that listens."""
         self._servers: list[asyncio.Server] = []
-        self._tasks: set[asyncio.Task[None]] = set()
         self._loop = asyncio.new_event_loop()
         self._thread = threading.Thread(target=self._loop.run_forever, name="door", daemon=True)
         self._thread.start()
@@ -337,11 +336,6 @@ class Door:
         await asyncio.sleep(0)
 
     # --- what its connections tell, on the door's own thread
-
-    def keep(self, task: asyncio.Task[None]) -> None:
-        """Holds a task until it has ended, as its loop does not."""
-        self._tasks.add(task)
-        task.add_done_callback(self._tasks.discard)
 
     def accepted(self, visitor: _Visitor) -> None:
         """Takes note of a new connection."""

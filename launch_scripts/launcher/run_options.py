@@ -77,52 +77,31 @@ def scenario_path(name: str) -> Path:
     )
 
 
-def with_network(
-    scenario: Scenario,
+def with_options(
+    network: NetworkConfig,
     *,
     connect: str | None = None,
     listen: str | None = None,
     also_listen: str | None = None,
     namespace: str | None = None,
     tls: TlsConfig | None = None,
-) -> Scenario:
-    """The scenario with other endpoints. Raises ConfigError where they would leave the machine unencrypted.
+) -> NetworkConfig:
+    """A network with what the options of a command change. Raises ConfigError where endpoints would leave the
+    machine unencrypted.
 
-    also_listen  an endpoint of the router beside those of the scenario
+    also_listen  an endpoint of the router beside those that it has
     """
-    network = scenario.network
     tls = tls or network.tls
     changes: dict[str, object] = {"tls": tls}
-    for option, endpoint in (("--connect", connect), ("--listen", listen)):
+    given = (("connect", connect, ()), ("listen", listen, ()), ("listen", also_listen, network.listen))
+    for key, endpoint, beside in given:
         if endpoint is not None:
-            check_endpoint(endpoint, tls is not None, option)
-            changes[option[2:]] = (endpoint,)
-    if also_listen is not None:
-        check_endpoint(also_listen, tls is not None, "--listen")
-        changes["listen"] = (*network.listen, also_listen)
+            check_endpoint(endpoint, tls is not None, f"--{key}")
+            changes[key] = (*beside, endpoint)
     if namespace is not None:
         changes["namespace"] = namespace
     raw = {**msgspec.to_builtins(network), **msgspec.to_builtins(changes)}
-    return msgspec.structs.replace(scenario, network=converted(raw, NetworkConfig, "network"))
-
-
-def tls_of(ca: str | None, certificate: str | None, key: str | None, folder: str | None = None) -> TlsConfig | None:
-    """The three --tls options, all or none; without them the files in the folder of --tls-dir."""
-    if ca is certificate is key is None:
-        if folder is None:
-            return None
-        if not Path(folder, "ca.pem").is_file():
-            raise ConfigError(f"--tls-dir: no file ca.pem in {folder}, which `swarm deploy certs` writes")
-        keys = [each for each in Path(folder).glob("*.key") if each.stem != "ca"]
-        own = keys[0] if len(keys) == 1 else None  # of many, a process finds its own by name
-        certificate, key = (folder, folder) if own is None else (str(own.with_suffix(".pem")), str(own))
-        return TlsConfig(ca=f"{folder}/ca.pem", certificate=certificate, key=key)
-    if ca is None or certificate is None or key is None:
-        raise ConfigError("--tls-ca, --tls-cert and --tls-key belong together: give all three")
-    for option, file in (("--tls-ca", ca), ("--tls-cert", certificate), ("--tls-key", key)):
-        if not Path(file).is_file() and (file == ca or not Path(file).is_dir()):
-            raise ConfigError(f"{option}: no file {file}")
-    return TlsConfig(ca=ca, certificate=certificate, key=key)
+    return converted(raw, NetworkConfig, "network")
 
 
 def as_process(scenario: Scenario, role: str, id: str) -> Scenario:

@@ -18,7 +18,7 @@ from launch_scripts.check.scenario_check import check_places, check_start
 from launch_scripts.launcher import run_options
 from launch_scripts.launcher.console import Terminal, live_table, plain_line, tunnel, what_is_left
 from launch_scripts.launcher.fetched_terrain import fetch_if_missing, find_members, missing_files
-from launch_scripts.launcher.forkserver import ROLES_AND_KERNELS, ROLES_ONLY, WarmUp
+from launch_scripts.launcher.forkserver import WarmUp
 from launch_scripts.launcher.local_processes import Ending, LocalSwarm
 from launch_scripts.launcher.log_file import JsonLines, Speaker, log_to
 from launch_scripts.launcher.ordered_planners import OrderedPlanners, with_target
@@ -148,7 +148,7 @@ class _Run:
         """The whole run. The exit code is 0 only if all went well."""
         self._register()
         planners = any(TABLE[role].kernels for role in self._options.roles)
-        self._warm_up = WarmUp(ROLES_AND_KERNELS if planners else ROLES_ONLY, self._scenario if planners else None)
+        self._warm_up = WarmUp(self._scenario if planners else None)
         try:
             return self._run()
         finally:

@@ -269,6 +269,15 @@ def inflate(ground: Floats, halves: Sequence[int]) -> Floats:
     return pace
 
 
+def nearest_open(is_open: Bools, row: int, col: int) -> tuple[int, int] | None:
+    """Returns row and column of the open cell nearest to another; None if there is none."""
+    rows, cols = np.nonzero(is_open)
+    if not len(rows):
+        return None
+    best = int(((rows - row) ** 2 + (cols - col) ** 2).argmin())
+    return int(rows[best]), int(cols[best])
+
+
 def largest_part(passable: Bools) -> Bools:
     """The largest connected part of the cells that can be driven, bool (rows, cols); none if there are none.
 

@@ -62,7 +62,7 @@ def expected(hint: Any) -> str:
     """Returns the values that a type allows, in words: "a whole number, 0 to 9"."""
     origin, args = typing.get_origin(hint), typing.get_args(hint)
     if origin is Annotated:
-        bounds = [word for meta in args[1:] if isinstance(meta, msgspec.Meta) for word in _bounds(meta)]
+        bounds = [word for meta in args[1:] if isinstance(meta, msgspec.Meta) for word in bounds_of(meta)]
         return ", ".join([expected(args[0]), *bounds])
     if origin in (types.UnionType, typing.Union):
         return " or ".join(expected(arg) for arg in args if arg is not type(None))
@@ -77,7 +77,8 @@ def expected(hint: Any) -> str:
     return _WORDS.get(hint, "something else")
 
 
-def _bounds(meta: msgspec.Meta) -> list[str]:
+def bounds_of(meta: msgspec.Meta) -> list[str]:
+    """The limits of a value in words: "0 to 9"."""
     low, high = _limit(meta.ge), _limit(meta.le)
     if meta.description is not None:
         return [meta.description]

@@ -108,10 +108,10 @@ def cost_layers_of(scenario: Scenario) -> list[NamedPlugin]:
     ]
 
 
-def check_name(plugin: NamedPlugin, source: str) -> None:
+def check_name(plugin: NamedPlugin) -> None:
     """Raises ConfigError where a name is neither built in nor `module:Name`. Imports nothing."""
     name, allowed = plugin.name, plugin.kind.built_in
     if name in allowed or ":" in name:
         return
     choices = ", ".join([*map(repr, allowed), "or a plug-in as 'module:Name'"])
-    raise ConfigError(f"{source}: {plugin.key}: found {quoted(name)}{nearest(name, allowed)}; allowed: {choices}")
+    raise ConfigError(f"{plugin.key}: found {quoted(name)}{nearest(name, allowed)}; allowed: {choices}")

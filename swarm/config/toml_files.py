@@ -16,7 +16,7 @@ import textwrap
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from itertools import islice
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import msgspec
 
@@ -37,7 +37,14 @@ from swarm.config.input_files import MAX_DEPTH, FileKind, parse_toml, quoted, re
 from swarm.config.plugin_names import check_name, plugins_of
 from swarm.config.scenario import Scenario, TlsConfig, ids_of
 from swarm.config.setting_types import MOST_TARGETS, RESERVED_GROUPS
-from swarm.config.vehicle_classes import aloft_classes, check_cost, class_faults, complete_costs, with_slope_csv
+from swarm.config.vehicle_classes import (
+    Fault,
+    aloft_classes,
+    class_faults,
+    complete_costs,
+    cost_faults,
+    with_slope_csv,
+)
 from swarm.errors import ConfigError
 from swarm.peers import split_rank
 from swarm.places import read_place
@@ -48,6 +55,36 @@ log = logging.getLogger(__name__)
 def load_scenario(path: Path) -> Scenario:
     """Reads and checks a scenario. Raises ConfigError that names the file and the key."""
     return parse_scenario(read_text(path, FileKind.SCENARIO), str(path), base=path.parent)
+
+
+class Reading(NamedTuple):
+    """Content of the text of a scenario.
+
+    scenario  a key that could not be read has its default; None if that is not enough
+    faults    a sentence each
+    doubtful  keys that could not be read, or contradict others: "groups[0].targets"
+    """
+
+    scenario: Scenario | None
+    faults: list[str]
+    doubtful: frozenset[str] = frozenset()
+
+    def knows(self, *keys: str) -> bool:
+        """Returns True if no doubtful key is one of these, above or below one, or another spelling of one. A key
+        without an index, such as "groups.targets", is that of all tables of the list."""
+        return not any(_concerns(key, each) for key in keys for each in self.doubtful)
+
+
+def _concerns(key: str, doubtful: str) -> bool:
+    ours, others = key.split("."), doubtful.split(".")
+    *above, (own, other) = zip(ours, others, strict=False)
+    # Only the last step of a key may be another spelling: those above it were read.
+    spelt = len(others) <= len(ours) and bool(nearest(other, [own]))
+    return (spelt or _is_of(own, other)) and all(_is_of(*each) for each in above)
+
+
+def _is_of(own: str, other: str) -> bool:
+    return own in (other, other.partition("[")[0])
 
 
 def parse_scenario(
@@ -61,32 +98,27 @@ def parse_scenario(
 
     settings  see `read_scenario`
     """
-    scenario, faults = read_scenario(text, source, base, most=1, settings=settings)
-    if scenario is None or faults:
-        raise ConfigError(faults[0])
-    return scenario
+    read = read_scenario(text, source, base, settings)
+    if read.scenario is None or read.faults:
+        raise ConfigError("\n".join(read.faults))
+    return read.scenario
 
 
 def read_scenario(
-    text: str,
-    source: str,
-    base: Path | None = None,
-    most: int = 50,
-    settings: Mapping[str, Any] | None = None,
-) -> tuple[Scenario | None, list[str]]:
-    """Returns the scenario of a text and its faults, up to a limit of sentences. A key that could not be read has
-    its default; None if that is not enough.
+    text: str, source: str, base: Path | None = None, settings: Mapping[str, Any] | None = None
+) -> Reading:
+    """Reads the scenario of a text, with all faults that can be known at once, up to a limit of sentences.
 
     settings  dotted key -> value, instead of what the text says (`with_settings`)
     """
     try:
         raw = with_settings(_of_today(parse_toml(text, source, ConfigError)), settings or {}, source)
     except ConfigError as error:
-        return None, [str(error)]
+        return Reading(None, [str(error)])
     faults: list[str] = []
     taken_out: set[tuple[str | int, ...]] = set()
     scenario: Scenario | None = None
-    while scenario is None and len(faults) < most:
+    while scenario is None and len(faults) < _MOST_FAULTS:
         try:
             scenario = msgspec.convert(raw, Scenario)
         except msgspec.ValidationError as error:
@@ -99,22 +131,33 @@ def read_scenario(
             taken_out.add(place)
             if not _take_out(raw, place):
                 break
-    if scenario is None or faults:  # the valid rest names its files
-        return None if scenario is None else anchored(scenario, base or Path()), faults
+    if scenario is None:
+        return Reading(None, faults)
     scenario = msgspec.convert(complete_costs(raw), Scenario)  # only now, so that a fault of [cost] is one fault
+    doubtful = {re.sub(r"\.(\d+)", r"[\1]", ".".join(map(str, place))) for place in taken_out}
+    contradictions = []
     try:
         classes = tuple(
-            msgspec.structs.replace(each, cost=with_slope_csv(each.cost, f"{source}: classes[{n}]", base))
+            msgspec.structs.replace(each, cost=with_slope_csv(each.cost, f"classes[{n}].cost", base))
             for n, each in enumerate(scenario.classes)
         )
-        cost = with_slope_csv(scenario.cost, source, base)
+        cost = with_slope_csv(scenario.cost, "cost", base)
         scenario = msgspec.structs.replace(scenario, cost=cost, classes=classes)
     except ConfigError as error:
-        return None, [str(error)]
-    faults += islice(_faults(scenario, source), most)
-    return scenario if base is None else anchored(scenario, base), faults
+        doubtful.add("cost.slope_csv")
+        contradictions = [((), str(error))]
+    known = Reading(scenario, faults, frozenset(doubtful))
+    for keys, fault in (*contradictions, *islice(_faults(scenario), _MOST_FAULTS)):
+        if known.knows(*keys):
+            faults.append(f"{source}: {fault}")
+            doubtful.update(keys)
+    if base is not None:
+        scenario = anchored(scenario, base)
+    return Reading(scenario, faults, frozenset(doubtful))
 
 
+_MOST_FAULTS = 50
+"""Sentences about one scenario: more are not read."""
 _FORMER: dict[str, str | tuple[object, ...]] = {
     "map.plot_regions": "shard_regions",
     "targets.body_radius_m": "obstacle_radius_m",
@@ -175,66 +218,77 @@ def _take_out(raw: dict[str, Any], place: tuple[str | int, ...]) -> bool:
     return bool(place) and parent.pop(place[-1], None) is not None
 
 
-def _faults(scenario: Scenario, source: str) -> Iterator[str]:
-    """Returns contradictions between individually valid settings."""
+def _faults(scenario: Scenario) -> Iterator[Fault]:
+    """Yields contradictions between individually valid settings."""
+    named = ("targets.name", "targets.count")
     count = sum(target.count for target in scenario.targets)
     if count > MOST_TARGETS:
-        yield f"{source}: targets: expected at most {MOST_TARGETS} in all, found {count}"
+        yield named, f"targets: expected at most {MOST_TARGETS} in all, found {count}"
     ids = scenario.target_ids
     rovers = (id for rover in scenario.rovers for id in ids_of(rover))
     classes, groups = (each.name for each in scenario.classes), (each.name for each in scenario.groups)
-    named = {"targets": ids, "rovers": rovers, "classes": classes, "groups": groups}
-    yield from (f"{source}: {each}" for what, names in named.items() for each in doubled(names, what))
+    for what, names in {"targets": ids, "rovers": rovers, "classes": classes, "groups": groups}.items():
+        yield from _about(doubled(names, what), f"{what}.name", f"{what}.count")
     for id in ids:
         if split_rank(id)[1]:  # planner and standby of two targets would share an id
-            yield f"{source}: targets: {id!r} is the name of a standby of another target; rename it"
+            yield named, f"targets: {id!r} is the name of a standby of another target; rename it"
     for key, section in (("cost", scenario.cost), ("terrain.hidden", scenario.terrain.hidden)):
         for n, zone in enumerate(section.zones):
-            yield from complaint(_check_zone, zone, f"{source}: {key}.zones[{n}]")
+            where = f"{key}.zones[{n}]"
+            yield from _about(complaint(_check_zone, zone, where), where)
     for n, target in enumerate(scenario.targets):
         if target.start is not None:
-            yield from complaint(read_place, target.start, f"{source}: targets[{n}].start")
+            key = f"targets[{n}].start"
+            yield from _about(complaint(read_place, target.start, key), key)
     for n, group in enumerate(scenario.groups):
+        key = f"groups[{n}].cells"
         for place in group.cells:
-            yield from complaint(read_place, place, f"{source}: groups[{n}].cells")
+            yield from _about(complaint(read_place, place, key), key)
     for plugin in plugins_of(scenario):
-        yield from complaint(check_name, plugin, source)
-    yield from complaint(check_cost, scenario.cost, source)
+        yield from _about(complaint(check_name, plugin), plugin.key)
+    yield from cost_faults(scenario.cost, "cost")
     aloft = [f"class {name}, which flies" for name in aloft_classes(scenario)]
     climbs = ["cost.directional = true"] * scenario.cost.directional + aloft
     if climbs and (weight := scenario.planner.length_weight):
-        yield f"{source}: planner.length_weight: {weight:g} does not go with {climbs[0]}; leave it out"
-    yield from class_faults(scenario, source)
-    yield from _group_faults(scenario, source)
+        said = f"planner.length_weight: {weight:g} does not go with {climbs[0]}; leave it out"
+        yield ("planner.length_weight", "cost.directional", "classes"), said
+    yield from class_faults(scenario)
+    yield from _group_faults(scenario)
     marked = scenario.monitor.show_target
     if marked and marked not in scenario.target_ids:
         known = choice(marked, scenario.target_ids, " there are ")
-        yield f"{source}: monitor.show_target is {marked!r}, which is no target{known}"
+        yield ("monitor.show_target", *named), f"monitor.show_target is {marked!r}, which is no target{known}"
+    has_tls = scenario.network.tls is not None
     for key in ("listen", "connect", "peers"):
         for endpoint in getattr(scenario.network, key):
-            has_tls = scenario.network.tls is not None
-            yield from complaint(check_endpoint, endpoint, has_tls, f"{source}: network.{key}")
+            where = f"network.{key}"
+            yield from _about(complaint(check_endpoint, endpoint, has_tls, where), where, "network.tls")
 
 
-def _group_faults(scenario: Scenario, source: str) -> Iterator[str]:
+def _about(faults: Iterator[str], *keys: str) -> Iterator[Fault]:
+    return ((keys, each) for each in faults)
+
+
+def _group_faults(scenario: Scenario) -> Iterator[Fault]:
     ids, names = scenario.target_ids, [group.name for group in scenario.groups]
     for name in names:
         reason = RESERVED_GROUPS.get(name.split(".")[0])
         if reason is not None:
-            yield f"{source}: groups: {name!r} is not free: {reason}"
+            yield ("groups.name",), f"groups: {name!r} is not free: {reason}"
         longer = [other for other in names if other.startswith(f"{name}.")]
         if longer:  # the id of an author begins with its group and a point
-            yield f"{source}: groups: {longer[0]!r} begins with the name of another group, {name!r}, and '.'"
-    for group in scenario.groups:
+            said = f"groups: {longer[0]!r} begins with the name of another group, {name!r}, and '.'"
+            yield ("groups.name",), said
+    for n, group in enumerate(scenario.groups):
         for id in group.targets:
             if id not in ids:
-                known = choice(id, ids, " there are ")
-                yield f"{source}: groups: {group.name} chases {id!r}, which is no target{known}"
+                said = f"groups: {group.name} chases {id!r}, which is no target{choice(id, ids, ' there are ')}"
+                yield (f"groups[{n}].targets", "targets.name", "targets.count"), said
         for key in ("reads", "writes"):
             for name in getattr(group, key):
                 if name != "*" and name not in names:
-                    where = f"{source}: groups: {group.name}: {key}"
-                    yield f"{where} names {name!r}, which is no group{nearest(name, names)}"
+                    said = f"groups: {group.name}: {key} names {name!r}, which is no group{nearest(name, names)}"
+                    yield (f"groups[{n}].{key}", "groups.name"), said
 
 
 _VALUES = {"factor": "factor", "pace": "pace_s_per_m"}

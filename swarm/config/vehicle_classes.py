@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import msgspec
 from msgspec import Meta
 
-from swarm.config.explain import choice, complaint, nearest
+from swarm.config.explain import choice, nearest
 from swarm.config.ground import CostConfig, ZoneConfig
 from swarm.config.input_files import FileKind, quoted, read_text
 from swarm.config.setting_types import Name, Positive, Section, Slope, SlopeFactor
@@ -67,18 +67,18 @@ _LEVEL_TOLERANCE = 1e-3
 """A table in three decimals may state 0.999 for flat ground; larger deviations are mistakes."""
 
 
-def with_slope_csv(cost: CostConfig, source: str, base: Path | None) -> CostConfig:
+def with_slope_csv(cost: CostConfig, where: str, base: Path | None) -> CostConfig:
     """The cost with the points of its `slope_csv`, which lies beside `base`. From then on the points are all that
-    counts, so processes need no file. Raises ConfigError."""
+    counts, so processes need no file. Raises ConfigError that names the key, below `where`."""
     if cost.slope_csv is None:
         return cost
     if cost.slope_table:
-        raise ConfigError(f"{source}: cost: slope_table and slope_csv exclude each other")
+        raise ConfigError(f"{where}: slope_table and slope_csv exclude each other")
     path = Path(cost.slope_csv) if base is None else base / cost.slope_csv
     try:
         points = read_slope_table(path, cost.flat_speed_m_per_s)
     except ConfigError as error:
-        raise ConfigError(f"{source}: cost.slope_csv: {error}") from error
+        raise ConfigError(f"{where}.slope_csv: {error}") from error
     return msgspec.structs.replace(cost, slope_csv=None, slope_table=points)
 
 
@@ -115,39 +115,46 @@ def read_slope_table(path: Path, flat_speed_m_per_s: float) -> tuple[tuple[float
     return tuple(points)
 
 
-def check_cost(cost: CostConfig, source: str) -> None:
-    """Raises ConfigError if individually valid settings of cost contradict each other."""
-    where = f"{source}: cost"
+Fault = tuple[tuple[str, ...], str]
+"""Keys of a scenario that contradict each other, and the sentence about them."""
+
+
+def cost_faults(cost: CostConfig, where: str) -> Iterator[Fault]:
+    """Yields contradictions between individually valid settings of a cost, which stands under the key `where`."""
+
+    def keys(*names: str) -> tuple[str, ...]:
+        return tuple(f"{where}.{name}" for name in names)
+
+    table = keys("slope_table", "slope_csv")
     if bool(cost.slope_table) != (cost.slope_rule == "table"):
         needs = (
             "needs slope_table or slope_csv" if cost.slope_rule == "table" else "reads no slope_table or slope_csv"
         )
-        raise ConfigError(f'{where}: slope_rule = "{cost.slope_rule}" {needs}')
-    _check_table(cost, where)
-    top = cost.top_speed_m_per_s
-    if top is not None and top < cost.flat_speed_m_per_s:
-        raise ConfigError(
-            f"{where}.top_speed_m_per_s: {top:g} is less than flat_speed_m_per_s = {cost.flat_speed_m_per_s:g}"
-        )
+        yield (*table, *keys("slope_rule", "preset")), f'{where}: slope_rule = "{cost.slope_rule}" {needs}'
+    yield from ((table, f"{where}.slope_table: {each}") for each in _table_faults(cost))
+    top, flat = cost.top_speed_m_per_s, cost.flat_speed_m_per_s
+    if top is not None and top < flat:
+        said = f"{where}.top_speed_m_per_s: {top:g} is less than flat_speed_m_per_s = {flat:g}"
+        yield keys("top_speed_m_per_s", "flat_speed_m_per_s", "preset"), said
     for key in ("max_climb_deg", "max_descent_deg"):
         if getattr(cost, key) is not None and not cost.directional:
-            raise ConfigError(f"{where}.{key} limits single steps: set directional = true, or use max_slope_deg")
+            said = f"{where}.{key} limits single steps: set directional = true, or use max_slope_deg"
+            yield keys(key, "directional", "preset"), said
 
 
-def _check_table(cost: CostConfig, where: str) -> None:
+def _table_faults(cost: CostConfig) -> Iterator[str]:
     points = cost.slope_table
     if not points:
         return
     for (slope, _), (following, _) in pairwise(points):
         if following <= slope:
-            raise ConfigError(
-                f"{where}.slope_table: {following:g} degrees come after {slope:g}, expected rising slopes"
-            )
+            yield f"{following:g} degrees come after {slope:g}, expected rising slopes"
+            return
     level = factor_at(points, 0.0)
     if abs(level - 1) > _LEVEL_TOLERANCE:
-        raise ConfigError(
-            f"{where}.slope_table: level ground takes {level:g} times the flat pace, expected 1: the speed on"
-            f" level ground is set by flat_speed_m_per_s = {cost.flat_speed_m_per_s:g}"
+        yield (
+            f"level ground takes {level:g} times the flat pace, expected 1: the speed on level ground"
+            f" is set by flat_speed_m_per_s = {cost.flat_speed_m_per_s:g}"
         )
 
 
@@ -242,34 +249,40 @@ def complete_costs(raw: dict[str, Any]) -> dict[str, Any]:
     return raw
 
 
-def class_faults(scenario: Scenario, source: str) -> Iterator[str]:
-    """Returns the faults of a scenario's classes, one sentence each, without those that `[cost]` has, too."""
+def class_faults(scenario: Scenario) -> Iterator[Fault]:
+    """Yields the faults of a scenario's classes, without those that `[cost]` has, too."""
     names = [each.name for each in scenario.classes]
-    held = set(complaint(check_cost, scenario.cost, ""))
     if GROUND in names:
-        yield f"{source}: classes: {GROUND!r} is the class of [cost] and [vehicles] itself; choose another name"
+        said = f"classes: {GROUND!r} is the class of [cost] and [vehicles] itself; choose another name"
+        yield ("classes.name",), said
+    held = {fault for _, fault in cost_faults(scenario.cost, "cost")}
     for n, each in enumerate(scenario.classes):
+        where = f"classes[{n}]"
         for key in SHARED:
             if getattr(each.cost, key) != getattr(scenario.cost, key):
-                yield f"{source}: classes[{n}].cost.{key} is for all classes alike: give it in [cost] instead"
-        own = complaint(check_cost, each.cost, "")
-        yield from (f"{source}: classes[{n}]{fault}" for fault in own if fault not in held)
+                said = f"{where}.cost.{key} is for all classes alike: give it in [cost] instead"
+                yield (f"{where}.cost.{key}", f"cost.{key}"), said
+        for keys, fault in cost_faults(each.cost, f"{where}.cost"):
+            if fault.removeprefix(f"{where}.") not in held:
+                yield (*keys, "cost"), fault
         if each.air is not None and not scenario.wind.speed_m_per_s < each.air.speed_m_per_s:
-            yield (
-                f"{source}: classes[{n}].air.speed_m_per_s: found {each.air.speed_m_per_s:g}, expected more than"
-                f" wind.speed_m_per_s = {scenario.wind.speed_m_per_s:g}: {each.name} could not fly against it"
+            key, wind = f"{where}.air.speed_m_per_s", scenario.wind.speed_m_per_s
+            said = (
+                f"{key}: found {each.air.speed_m_per_s:g}, expected more than wind.speed_m_per_s = {wind:g}:"
+                f" {each.name} could not fly against it"
             )
+            yield (key, "wind.speed_m_per_s"), said
         for k, zone in enumerate(each.air.no_fly if each.air is not None else ()):
             drawn = zone.polygon is not None or zone.polygon_m is not None
             if zone.kind != "forbidden" or not drawn or zone.file is not None or zone.mask is not None:
-                yield (
-                    f'{source}: classes[{n}].air.no_fly[{k}]: expected kind = "forbidden" and a polygon,'
-                    f" found kind {zone.kind!r}{'' if drawn else ' and no polygon'}"
-                )
-    for group in scenario.groups:
+                key, lacks = f"{where}.air.no_fly[{k}]", "" if drawn else " and no polygon"
+                said = f'{key}: expected kind = "forbidden" and a polygon, found kind {zone.kind!r}{lacks}'
+                yield (key,), said
+    for n, group in enumerate(scenario.groups):
         if group.vehicle_class not in (GROUND, *names):
             known = choice(group.vehicle_class, [GROUND, *names], " there are ")
-            yield f"{source}: groups: {group.name}: class is {group.vehicle_class!r}, which is no class{known}"
+            said = f"groups: {group.name}: class is {group.vehicle_class!r}, which is no class{known}"
+            yield (f"groups[{n}].class", "classes.name"), said
 
 
 def driven_classes(scenario: Scenario) -> list[str]:

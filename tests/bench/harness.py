@@ -27,6 +27,7 @@ from rich.progress import Progress
 from rich.table import Table
 
 from launch_scripts.observe.run_folders import processor
+from launch_scripts.typer_commands import Command
 from swarm.errors import ConfigError
 
 BENCHMARKS = {
@@ -118,7 +119,7 @@ def benchmark(
         signature = signature.replace(parameters=[*signature.parameters.values(), as_json], return_annotation=None)
         run.__signature__ = signature  # type: ignore[attr-defined]
         run.__annotations__ = {each.name: each.annotation for each in signature.parameters.values()}
-        app.command(title)(run)
+        app.command(title, cls=Command)(run)
         return function
 
     return register

@@ -15,7 +15,8 @@ from support.live_swarm import Hands, swarm
 from support.makers import route_reply
 from support.processes import eventually
 
-from launch_scripts.launcher.run_options import as_process, tls_of
+from launch_scripts.commands.shared_options import Tls
+from launch_scripts.launcher.run_options import as_process
 from launch_scripts.ports import free_ports
 from swarm.bus.bus import Asked, Event, Heard
 from swarm.bus.zenoh_bus import ZenohBus, open_bus
@@ -37,7 +38,7 @@ def tls(folder: Path) -> list[str]:
 def opened(hands: Hands, role: str, id: str, certs: Path, endpoint: str) -> ZenohBus:
     """A session with the certificate of a process."""
     scenario = load_scenario(hands.path)
-    files = tls_of(str(certs / "ca.pem"), str(certs), str(certs))
+    files = Tls(None, str(certs / "ca.pem"), str(certs), str(certs)).tls()
     network = msgspec.structs.replace(scenario.network, connect=(endpoint,), tls=files)
     return open_bus(as_process(msgspec.structs.replace(scenario, network=network), role, id).network)
 

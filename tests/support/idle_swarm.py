@@ -8,7 +8,7 @@ from pathlib import Path
 
 from support.processes import eventually
 
-from launch_scripts.launcher.forkserver import WarmUp
+from launch_scripts.launcher.forkserver import WarmUp, start_forkserver
 from launch_scripts.launcher.local_processes import LocalSwarm
 from launch_scripts.process_table import ProcessSpec
 from swarm.config.scenario import Scenario
@@ -28,5 +28,6 @@ def idle_swarm(folder: Path, *rows: tuple[str, str, str]) -> LocalSwarm:
 
 @cache
 def _warmed_up() -> None:
+    start_forkserver(None)
     warm_up = WarmUp(None)
     eventually(lambda: warm_up.done(0.05), 20)

@@ -1,6 +1,7 @@
 """The harness of benchmarks: each command is listed, and answers bad input with a sentence."""
 
 import json
+import re
 from typing import Any
 
 import pytest
@@ -46,6 +47,12 @@ def test_a_report_is_one_object_with_its_machine_or_tables_with_the_chosen_colum
 def test_a_figure_that_must_be_nothing_is_the_exit_code(made: None) -> None:
     assert run("made").exit_code == 0
     assert run("made", "--wrong", "1").exit_code == 1
+
+
+def test_help_has_the_bounds_of_a_number_once_and_in_words() -> None:
+    said = run("peers", "--help").output
+    assert {"INTEGER", "[at"} <= set(said.split())
+    assert not {"range", "<int", "x>=1"}.intersection(re.split(r"[\s\]>]", said))
 
 
 def fail() -> None:

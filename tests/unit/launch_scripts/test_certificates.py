@@ -21,19 +21,6 @@ def test_what_is_there_is_replaced_only_when_asked(tmp_path: Path) -> None:
     assert path.read_bytes() != before
 
 
-@pytest.mark.parametrize(
-    ("name", "hosts", "says"),
-    [
-        ("no/name", [], "name 'no/name' is not 1 to 64 of letters"),
-        ("ca", [], "the name ca is the authority's own"),
-        ("a0", ["bücher.example"], "host 'bücher.example' is neither an address nor a name in ASCII"),
-    ],
-)
-def test_a_name_that_cannot_be_one_is_refused(tmp_path: Path, name: str, hosts: list[str], says: str) -> None:
-    with pytest.raises(ConfigError, match=says):
-        issue(tmp_path, name, hosts, 30)
-
-
 def test_a_damaged_authority_is_told_of(tmp_path: Path) -> None:
     issue(tmp_path, "a0", [], 30)
     (tmp_path / "ca.key").write_bytes((tmp_path / "a0.key").read_bytes())

@@ -3,8 +3,6 @@
 import csv
 import json
 import socket
-import subprocess
-import sys
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -15,6 +13,7 @@ from support.command import Swarm
 from support.makers import route_reply, run_info
 
 from launch_scripts import ports
+from launch_scripts.commands.shared_options import Tls
 from launch_scripts.commands.swarm_route import Answer, as_json, show, write
 from launch_scripts.launcher import run_options
 from launch_scripts.observe.run_folders import begin_run, run_facts
@@ -38,20 +37,15 @@ def test_the_version_is_the_packages_with_the_commit_of_a_checkout_as_in_a_run(
     assert said == f"swarm {run_facts(tmp_path)['versions']['terrain_swarm']}\n"
 
 
-def test_help_is_quick_because_it_imports_neither_zenoh_nor_numpy() -> None:
-    program = "import launch_scripts.cli, sys; sys.exit('zenoh' in sys.modules or 'numpy' in sys.modules)"
-    subprocess.run([sys.executable, "-c", program], check=True)
-
-
 def test_a_folder_stands_for_the_three_files_of_tls(tmp_path: Path) -> None:
     names = ("ca.pem", "ca.key", "operator.anna.pem", "operator.anna.key")
     files = [tmp_path / name for name in names]
     for file in files:
         file.write_text("")
     (ca, _, certificate, key) = map(str, files)
-    assert run_options.tls_of(None, None, None, str(tmp_path)) == TlsConfig(ca=ca, certificate=certificate, key=key)
+    assert Tls(tls_dir=str(tmp_path)).tls() == TlsConfig(ca=ca, certificate=certificate, key=key)
     (tmp_path / "planner.t0.key").write_text("")  # of several, each process finds its own
-    own = run_options.tls_of(None, None, None, str(tmp_path))
+    own = Tls(tls_dir=str(tmp_path)).tls()
     assert own == TlsConfig(ca=ca, certificate=str(tmp_path), key=str(tmp_path))
 
 

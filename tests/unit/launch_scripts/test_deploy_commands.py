@@ -7,12 +7,12 @@ from pathlib import Path
 
 import pytest
 from cryptography import x509
-from typer.testing import CliRunner, Result
+from support.command import Swarm
 
-from launch_scripts.commands.deploy_commands import app
+from launch_scripts.commands.shared_options import Tls
 from launch_scripts.deploy import certificates
 from launch_scripts.deploy.certificates import THIS_MACHINE, called_of, check_signed, hosts_of
-from launch_scripts.launcher.run_options import as_process, tls_of
+from launch_scripts.launcher.run_options import as_process
 from launch_scripts.process_table import LAUNCHER, certificate_names, processes_of
 from swarm.config.toml_files import load_scenario
 from swarm.errors import ConfigError
@@ -33,13 +33,11 @@ def scenario(tmp_path: Path) -> Path:
     return path
 
 
-def run(*arguments: object) -> Result:
-    return CliRunner().invoke(app, list(map(str, arguments)))
-
-
-def test_every_process_of_a_scenario_gets_a_certificate_and_finds_its_own(tmp_path: Path, scenario: Path) -> None:
+def test_every_process_of_a_scenario_gets_a_certificate_and_finds_its_own(
+    tmp_path: Path, scenario: Path, swarm: Swarm
+) -> None:
     certs = tmp_path / "certs"
-    assert run("certs", certs, "--scenario", scenario, "router.0=10.0.0.1").exit_code == 0
+    assert swarm("deploy certs", certs, "--scenario", scenario, "router.0=10.0.0.1")[0] == 0
     loaded = load_scenario(scenario)
     names = certificate_names(loaded)
     assert {path.stem for path in certs.glob("*.pem")} == {"ca", *names}
@@ -49,7 +47,7 @@ def test_every_process_of_a_scenario_gets_a_certificate_and_finds_its_own(tmp_pa
     assert [str(host.value) for host in hosts] == ["10.0.0.1", "localhost", "127.0.0.1"]
     assert not router.extensions.get_extension_for_class(x509.BasicConstraints).value.ca
     assert 364 <= (router.not_valid_after_utc - datetime.datetime.now(datetime.UTC)).days <= 365
-    files = tls_of(str(certs / "ca.pem"), str(certs), str(certs))
+    files = Tls(None, str(certs / "ca.pem"), str(certs), str(certs)).tls()
     scenario.write_text(
         scenario.read_text() + f'tls = {{ca = "{files.ca}", certificate = "certs", key = "certs"}}\n'
     )
@@ -63,29 +61,33 @@ def test_every_process_of_a_scenario_gets_a_certificate_and_finds_its_own(tmp_pa
         as_process(loaded, "keeper", "west")
 
 
-def test_what_is_there_stays_and_a_revoked_name_gets_its_next_number(tmp_path: Path, scenario: Path) -> None:
+def test_what_is_there_stays_and_a_revoked_name_gets_its_next_number(
+    tmp_path: Path, scenario: Path, swarm: Swarm
+) -> None:
     certs, revoked = tmp_path / "certs", "agent.all.a0"
-    run("certs", certs, "--scenario", scenario)
+    swarm("deploy certs", certs, "--scenario", scenario)
     before = {path: path.read_bytes() for path in certs.iterdir()}
-    assert run("certs", certs, "--scenario", scenario).exit_code == 0
+    assert swarm("deploy certs", certs, "--scenario", scenario)[0] == 0
     assert {path: path.read_bytes() for path in certs.iterdir()} == before
     scenario.write_text(scenario.read_text() + f'revoked = ["{revoked}"]\n')
-    assert run("certs", certs, revoked, "--renew", "--scenario", scenario).exit_code == 0
+    assert swarm("deploy certs", certs, "--scenario", scenario)[0] == 0
     assert called_of(certs / f"{revoked}.pem") == f"{revoked}~2"
     changed = {path.stem for path, was in before.items() if path.read_bytes() != was}
     assert changed == {revoked}
 
 
 def test_what_a_scenario_needs_and_ends_soon_is_made_anew_with_the_hosts_that_it_had(
-    tmp_path: Path, scenario: Path, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, scenario: Path, swarm: Swarm, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     certs = tmp_path / "certs"
     with monkeypatch.context() as earlier:
         earlier.setattr(certificates, "_CLOCKS_DIFFER", datetime.timedelta(days=20))
-        run("certs", certs, "router.0=10.0.0.1,base.local", "keeper.0", "--days", 9)  # less than a third is left
-        run("certs", certs, "planner.t0", "--days", 11)
+        swarm(
+            "deploy certs", certs, "router.0=10.0.0.1,base.local", "keeper.0", "--days", 9
+        )  # less than a third is left
+        swarm("deploy certs", certs, "planner.t0", "--days", 11)
     before = {path.stem: path.read_bytes() for path in certs.glob("*.pem")}
-    assert run("certs", certs, "--scenario", scenario).exit_code == 0
+    assert swarm("deploy certs", certs, "--scenario", scenario)[0] == 0
     changed = {name for name, was in before.items() if (certs / f"{name}.pem").read_bytes() != was}
     assert changed == {"router.0", "keeper.0"}
     assert hosts_of(certs / "router.0.pem") == {"10.0.0.1", "base.local", *THIS_MACHINE}
@@ -93,35 +95,34 @@ def test_what_a_scenario_needs_and_ends_soon_is_made_anew_with_the_hosts_that_it
         check_signed(certs / "ca.pem", certs / f"{name}.pem", certs / f"{name}.key")
 
 
-def test_zenohd_admits_the_processes_of_a_scenario_and_needs_certificates(tmp_path: Path, scenario: Path) -> None:
+def test_zenohd_admits_the_processes_of_a_scenario_and_needs_certificates(
+    tmp_path: Path, scenario: Path, swarm: Swarm
+) -> None:
     certs, out = tmp_path / "certs", tmp_path / "zenohd.json5"
-    run("certs", certs, "--scenario", scenario)
+    swarm("deploy certs", certs, "--scenario", scenario)
     files = ("--tls-ca", certs / "ca.pem", "--tls-cert", certs, "--tls-key", certs)
-    told = run("zenohd", out, "--listen", "tls/0.0.0.0:7447", *files)
-    assert isinstance(told.exception, ConfigError)
-    assert run("zenohd", out, "--listen", "tls/0.0.0.0:7447", *files, "--scenario", scenario).exit_code == 0
+    told = swarm("deploy zenohd", out, "--listen", "tls/0.0.0.0:7447", *files)
+    assert told[0] == 2
+    assert swarm("deploy zenohd", out, "--listen", "tls/0.0.0.0:7447", *files, "--scenario", scenario)[0] == 0
     config = json.loads(out.read_text())
     named = {name for each in config["access_control"]["subjects"] for name in each.get("cert_common_names", ())}
     assert named == set(certificate_names(load_scenario(scenario)))
     assert config["transport"]["link"]["tls"]["listen_certificate"] == str(certs / "router.0.pem")
-    assert run("zenohd", out, "--force", "--listen", "tcp/127.0.0.1:7447").exit_code == 0
+    assert swarm("deploy zenohd", out, "--force", "--listen", "tcp/127.0.0.1:7447")[0] == 0
     assert "access_control" not in json.loads(out.read_text())
 
 
-def test_a_plan_is_shown_and_written_for_each_machine(tmp_path: Path, scenario: Path) -> None:
+def test_a_plan_is_shown_and_written_for_each_machine(tmp_path: Path, scenario: Path, swarm: Swarm) -> None:
     machines = "".join(f'[[hosts]]\nname = "m{n}"\naddress = "10.0.0.{n}"\n' for n in (1, 2, 3))
     hosts, kits = tmp_path / "hosts.toml", tmp_path / "kits"
     hosts.write_text(machines)
-    shown = run("plan", scenario, "--hosts", hosts)
-    assert shown.exit_code == 0
-    assert {"m1", "m2", "m3"} <= set(shown.stdout.split())
-    assert (
-        "the run survives the loss of any 1 of its 3 machines; the vehicles of a lost machine stop" in shown.stdout
-    )
-    assert " records the run and writes its report" in shown.stdout
+    code, shown, _ = swarm("deploy plan", scenario, "--hosts", hosts)
+    assert code == 0
+    assert {"m1", "m2", "m3"} <= set(shown.split())
+    assert "the run survives the loss of any 1 of its 3 machines; the vehicles of a lost machine stop" in shown
+    assert " records the run and writes its report" in shown
     assert not kits.exists()
-    told = run("plan", scenario, "--hosts", hosts, "--out", kits, "--json")
-    plan = json.loads(told.stdout)
+    plan = json.loads(swarm("deploy plan", scenario, "--hosts", hosts, "--out", kits, "--json")[1])
     assert plan["archives"] == [str(kits / f"m{n}.tar.gz") for n in (1, 2, 3)]
     names = [process["certificate"] for host in plan["hosts"] for process in host["processes"]]
     assert {path.stem for path in (kits / "certs").glob("*.key")} == {

@@ -11,9 +11,8 @@ from pathlib import Path
 
 import pytest
 import yaml
-from typer.testing import CliRunner
+from support.command import Swarm
 
-from launch_scripts.commands.deploy_commands import app
 from launch_scripts.deploy import certificates
 from launch_scripts.deploy.certificates import authority, called_of, check_signed, ends_on, hosts_of, issue
 from launch_scripts.deploy.machine_archives import UNIT, keep_plan, keepers_before, systemd_files, write_kits
@@ -45,7 +44,7 @@ def planned(text: str = SCENARIO, machines: HostsConfig = THREE, base: Path | No
 
 def unpacked(plan: Plan, out: Path) -> list[Path]:
     """Writes archives and unpacks them; the folder of each machine."""
-    archives = write_kits(plan, out, systemd_files, 7)
+    archives = write_kits(plan, out, 7)
     for archive in archives:
         assert stat.S_IMODE(archive.stat().st_mode) == 0o600
         with tarfile.open(archive) as file:
@@ -100,9 +99,9 @@ def test_a_second_plan_keeps_keys_that_need_not_be_others(tmp_path: Path) -> Non
     def keys() -> dict[str, bytes]:
         return {path.stem: path.read_bytes() for path in certs.glob("*.key")}
 
-    write_kits(planned(), tmp_path, systemd_files, 7)
+    write_kits(planned(), tmp_path, 7)
     before = keys()
-    write_kits(planned(machines=hosts("10.0.0.1", "10.0.0.9", "10.0.0.3")), tmp_path, systemd_files, 7)
+    write_kits(planned(machines=hosts("10.0.0.1", "10.0.0.9", "10.0.0.3")), tmp_path, 7)
     assert {name for name, key in keys().items() if key != before[name]} == {"router.1"}
     before = keys()
     revoke(certs, ["agent.all.a0"])
@@ -122,7 +121,7 @@ def test_an_authority_that_is_not_valid_today_signs_and_checks_nothing(
         patched.setattr(certificates, "_CA_DAYS", start_days + 10)
         authority(certs)
     with pytest.raises(StoreError, match=r"ca\.pem is good from .* not today; make an authority and all"):
-        write_kits(planned(), tmp_path, systemd_files, 7)
+        write_kits(planned(), tmp_path, 7)
     assert not list(tmp_path.glob("*.tar.gz"))
 
 
@@ -143,10 +142,10 @@ def test_no_certificate_outlives_its_authority(tmp_path: Path, monkeypatch: pyte
 def test_archives_of_machines_that_are_gone_are_removed_and_no_other_file(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    write_kits(planned(), tmp_path, systemd_files, 7)
+    write_kits(planned(), tmp_path, 7)
     (tmp_path / "mine.tar.gz").write_text("")
     assert capsys.readouterr().err == ""
-    write_kits(planned(machines=hosts("10.0.0.1", "10.0.0.2")), tmp_path, systemd_files, 7)
+    write_kits(planned(machines=hosts("10.0.0.1", "10.0.0.2")), tmp_path, 7)
     assert {path.name for path in tmp_path.glob("*.gz")} == {"m0.tar.gz", "m1.tar.gz", "mine.tar.gz"}
     assert (
         capsys.readouterr().err == f"{tmp_path / 'm2.tar.gz'}: removed, as the plan has no machine of this name\n"
@@ -156,7 +155,7 @@ def test_archives_of_machines_that_are_gone_are_removed_and_no_other_file(
 def test_no_archive_outside_of_the_folder_is_removed(tmp_path: Path) -> None:
     (tmp_path / "mine.tar.gz").write_text("")
     out = tmp_path / "kits"
-    write_kits(planned(), out, systemd_files, 7)
+    write_kits(planned(), out, 7)
     text = (out / "plan.json").read_text()
     (out / "plan.json").write_text(text.replace('"name": "m2"', '"name": "../mine"'))
     with pytest.raises(StoreError, match=r"plan\.json is no plan of `swarm deploy plan`"):
@@ -262,7 +261,7 @@ def test_the_service_is_shut_off_from_the_rest_of_the_machine(tmp_path: Path) ->
 def test_what_lies_in_the_folder_of_a_plan_before_is_read_as_one(tmp_path: Path) -> None:
     plan = planned()
     assert keepers_before(tmp_path, plan.run_id) == {}
-    write_kits(plan, tmp_path, systemd_files, 7)
+    write_kits(plan, tmp_path, 7)
     keepers = {keeper.id: host.name for host in plan.hosts for keeper in host.of("keeper")}
     assert keepers_before(tmp_path, plan.run_id) == keepers
     assert keepers_before(tmp_path, "another-run") == {}
@@ -273,17 +272,17 @@ def test_what_lies_in_the_folder_of_a_plan_before_is_read_as_one(tmp_path: Path)
         keepers_before(tmp_path, plan.run_id)
 
 
-def test_a_machine_of_containers_has_all_that_its_compose_file_names_and_no_launchers_key(tmp_path: Path) -> None:
+def test_a_machine_of_containers_has_all_that_its_compose_file_names_and_no_launchers_key(
+    tmp_path: Path, swarm: Swarm
+) -> None:
     lay_ground(tmp_path)
     (tmp_path / "small.toml").write_text(ON_GROUND)
     machines = (f'[[hosts]]\nname = "{name}"\naddress = "10.0.0.{n}"\n' for n, name in enumerate(("base", "north")))
     (tmp_path / "hosts.toml").write_text("".join(machines))
     (tmp_path / "swarm.whl").write_bytes(b"")
-    line = f"plan {tmp_path}/small.toml --hosts {tmp_path}/hosts.toml --out {tmp_path}/kits --kit compose"
-    done = CliRunner().invoke(app, [*line.split(), "--wheel", f"{tmp_path}/swarm.whl"])
-    assert "--wheel: found" in str(done.exception), "containers have an image"
-    done = CliRunner().invoke(app, line.split())
-    assert done.exit_code == 0, done.output
+    line = f"deploy plan {tmp_path}/small.toml --hosts {tmp_path}/hosts.toml --out {tmp_path}/kits --kit compose"
+    assert "--wheel: found" in swarm(f"{line} --wheel {tmp_path}/swarm.whl")[2], "containers have an image"
+    assert swarm(line)[0] == 0
     for host in ("base", "north"):
         with tarfile.open(tmp_path / "kits" / f"{host}.tar.gz") as archive:
             archive.extractall(tmp_path, filter="data")

@@ -6,13 +6,12 @@ import math
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from typer.testing import CliRunner
+from support.command import Swarm as Command
 
-from launch_scripts.commands.deploy_commands import app
 from launch_scripts.deploy.machines_needed import Swarm, measured_runs, needs_on, reaches
 
 
-def swarm(vehicles: int, targets: int, per_agent: int = 200) -> Swarm:
+def sized(vehicles: int, targets: int, per_agent: int = 200) -> Swarm:
     side = max(round(math.sqrt(262.144 * vehicles)), 32)
     return Swarm(vehicles=vehicles, targets=targets, agents=-(-vehicles // per_agent), side=side, tick_hz=5.0)
 
@@ -27,7 +26,7 @@ def test_a_measured_swarm_needs_what_it_took(run: Swarm) -> None:
 
 @settings(max_examples=20, deadline=None)
 @given(
-    st.builds(swarm, st.integers(20, 20_000), st.integers(1, 300), st.integers(20, 1000)),
+    st.builds(sized, st.integers(20, 20_000), st.integers(1, 300), st.integers(20, 1000)),
     st.sampled_from([1, 2, 7, 30]),
 )
 def test_needs_are_finite_and_positive_and_nothing_crosses_on_one_machine(size: Swarm, machines: int) -> None:
@@ -41,14 +40,11 @@ def test_needs_are_finite_and_positive_and_nothing_crosses_on_one_machine(size: 
         assert 0 < found.link_mbit_per_s <= found.first_link_mbit_per_s
 
 
-def test_a_small_swarm_fits_one_machine_and_a_full_process_is_named() -> None:
-    ran = CliRunner().invoke(app, ["size", "--vehicles", "100", "--targets", "4", "--json"])
-    assert ran.exit_code == 0, ran.output
-    report = json.loads(ran.stdout)
-    assert (report["machines"], report["full"], report["extrapolated"]) == (1, [], False)
-    ran = CliRunner().invoke(
-        app, ["size", "--vehicles", "20000", "--targets", "100", "--cores", "64", "--memory", "512"]
-    )
-    assert ran.exit_code == 1
-    assert "process takes" in ran.stdout
-    assert "Extrapolated" in ran.stdout
+def test_a_small_swarm_fits_one_machine_and_a_full_process_is_named(swarm: Command) -> None:
+    code, out, _ = swarm("deploy size --vehicles 100 --targets 4 --json")
+    report = json.loads(out)
+    assert (code, report["machines"], report["full"], report["extrapolated"]) == (0, 1, [], False)
+    code, out, _ = swarm("deploy size --vehicles 20000 --targets 100 --cores 64 --memory 512")
+    assert code == 1
+    assert "process takes" in out
+    assert "Extrapolated" in out

@@ -6,7 +6,6 @@ import http.client
 import json
 import signal
 import socket
-import subprocess
 import sys
 import threading
 import time
@@ -291,20 +290,6 @@ def test_a_port_or_address_that_cannot_be_had_is_named(server: Server) -> None:
         Server("health port", place(server)[1], {})
     with pytest.raises(BusError, match=r"health port 0 at 192\.0\.2\.1 cannot be opened"):
         Server("health port", 0, {}, "192.0.2.1")
-
-
-def test_a_probe_loads_no_command_line() -> None:
-    """A probe is started every few seconds, on machines that are busy."""
-    what = (
-        "import sys; sys.argv = ['swarm', 'health', '--url', 'http://127.0.0.1:1'];"
-        "from launch_scripts.entry import main; code = main();"
-        "print(code, *sorted({name.partition('.')[0] for name in sys.modules}))"
-    )
-    told = subprocess.run([sys.executable, "-c", what], capture_output=True, text=True, timeout=60, check=True)
-    code, *loaded = told.stdout.split()
-    assert code == "4"
-    heavy = {"typer", "click", "rich", "numpy", "msgspec", "zenoh", "asyncio", "http", "email", "ssl", "numba"}
-    assert not heavy & set(loaded)
 
 
 class Machine:

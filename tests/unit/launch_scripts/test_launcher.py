@@ -114,12 +114,19 @@ def test_why_a_process_ended_is_said_and_only_one_that_refuses_is_not_started_ag
     assert ("Traceback" in log) <= (again_s is not None)
 
 
-def test_who_does_not_end_when_asked_is_killed_and_named(
-    swarms: list[LocalSwarm], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+@pytest.mark.parametrize(
+    ("function", "sentence"),
+    [
+        ("stubborn", "keeper-0 did not end within 0.5 s and was killed"),
+        ("fail_at_the_end", "keeper-0 was asked to end, but RuntimeError: could not write the last page"),
+    ],
+)
+def test_who_does_not_end_when_asked_or_fails_then_is_named(
+    function: str, sentence: str, swarms: list[LocalSwarm], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr("launch_scripts.launcher.local_processes.STOP_GRACE_S", 0.5)
-    swarm = started(swarms, tmp_path, ("agent", "a0", "stubborn"), ("router", "0", "quiet"))
-    assert "agent-a0 did not end within 0.5 s and was killed" in swarm.stop(lambda: time.sleep(0.02))
+    swarm = started(swarms, tmp_path, ("keeper", "0", function), ("router", "0", "quiet"))
+    assert sentence in swarm.stop(lambda: time.sleep(0.02))
 
 
 def test_who_has_ended_as_asked_and_does_not_leave_holds_up_nobody_and_is_no_failure(
@@ -183,23 +190,20 @@ def test_refusals_far_apart_never_end_a_run(tmp_path: Path, monkeypatch: pytest.
     assert refused(swarm, ran_s=80_000.0, restarts=0) == 0.2  # its first generation was a good one
 
 
-def test_five_refusals_within_a_minute_and_a_refused_first_start_are_final(tmp_path: Path) -> None:
-    swarm = swarm_of([], tmp_path, ("planner", "t0", "quiet"))
-    assert [refused(swarm, ran_s=1.0) for _ in range(5)] == [0.2, 0.4, 0.8, 1.6, None]
-    swarm = swarm_of([], tmp_path, ("planner", "t0", "quiet"))
-    assert refused(swarm, ran_s=1.0, restarts=0) is None
-
-
-def test_a_monitor_that_is_refused_is_tried_once_a_minute_and_ends_nothing(tmp_path: Path) -> None:
-    swarm = swarm_of([], tmp_path, ("monitor", "0", "quiet"))
-    assert refused(swarm, ran_s=1.0, restarts=0) == 60.0
-    assert [refused(swarm, ran_s=1.0) for _ in range(6)] == [0.4, 0.8, 1.6, 60.0, 60.0, 60.0]
-
-
-def test_who_fails_while_ending_is_named(swarms: list[LocalSwarm], tmp_path: Path) -> None:
-    swarm = started(swarms, tmp_path, ("keeper", "0", "fail_at_the_end"))
-    (failure,) = swarm.stop(lambda: time.sleep(0.02))
-    assert failure == "keeper-0 was asked to end, but RuntimeError: could not write the last page"
+@pytest.mark.parametrize(
+    ("role", "first_start", "waits_s"),
+    [
+        ("planner", False, [0.2, 0.4, 0.8, 1.6, None]),  # five within a minute are final
+        ("planner", True, [None]),
+        ("monitor", False, [0.2, 0.4, 0.8, 1.6, 60.0, 60.0]),  # it ends nothing, and is tried once a minute
+        ("monitor", True, [60.0]),
+    ],
+)
+def test_refusals_at_the_first_start_or_close_together_are_final_unless_a_run_goes_on_without_the_process(
+    role: str, first_start: bool, waits_s: list[float | None], tmp_path: Path
+) -> None:
+    swarm = swarm_of([], tmp_path, (role, "0", "quiet"))
+    assert [refused(swarm, ran_s=1.0, restarts=int(not first_start)) for _ in waits_s] == waits_s
 
 
 def test_processes_are_added_and_dismissed_while_the_others_run(tmp_path: Path, swarms: list[LocalSwarm]) -> None:

@@ -145,6 +145,7 @@ def test_a_mistake_is_answered_with_what_to_do(
         (place / name).write_text(text, encoding="utf-8")
     if "given" in mistake:  # the function of this name lays it out
         globals()[mistake["given"]](place, request)
+    before = {path: path.read_bytes() for path in place.rglob("*") if path.is_file()}
     line = mistake.get("do", "check s.toml").replace("PORT", str(free_ports(1)[0]))
     monkeypatch.setattr(sys, "argv", ["swarm", *shlex.split(line)])
     try:
@@ -159,3 +160,5 @@ def test_a_mistake_is_answered_with_what_to_do(
     assert len(said.splitlines()) <= 2, said
     assert len(said) <= LONGEST_ANSWER, said
     assert not any(place.glob("runs/*")), "what was refused is no run, and leaves none"
+    after = {path: path.read_bytes() for path in place.rglob("*") if path.is_file()}
+    assert after == before, "what was refused writes nothing, and changes nothing"

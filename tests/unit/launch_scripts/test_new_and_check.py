@@ -95,14 +95,6 @@ def _sections() -> list[type[typing.Any]]:
     return [each for module in modules for each in module.values() if isinstance(each, type(Scenario))]
 
 
-def test_nothing_is_written_over(tmp_path: Path, swarm: Swarm) -> None:
-    (tmp_path / "my.toml").write_text("seed = 5\n")
-    assert swarm("new my.toml")[0] == 2
-    assert (tmp_path / "my.toml").read_text() == "seed = 5\n"
-    assert swarm("new other.toml --walk fly")[0] == 2
-    assert not (tmp_path / "other.toml").exists()
-
-
 FEW = settings(max_examples=25, deadline=None, suppress_health_check=[HealthCheck.too_slow])
 
 
@@ -186,13 +178,74 @@ vehicles = 0
 vehicles = 1.5
 start = "heap"
 """
-    scenario, faults = read_scenario(text, "s.toml")
+    scenario, faults, _ = read_scenario(text, "s.toml")
     assert scenario is not None
     assert [each.about for each in files_named(scenario)] == ["terrain.source"]
     keys = ["seed", "secnds", "terrain.rodes", "cost.zones[0].kind", "groups[0].vehicles", "groups[1].vehicles"]
-    assert len(faults) == 7
-    for key, fault in zip([*keys, "groups[1].start"], faults, strict=True):
+    for key, fault in zip([*keys, "groups[1].start", "two groups are called 'all'"], faults, strict=True):
         assert key in fault, (key, fault)
+
+
+SEVERAL = """seed = 1.5
+secnds = 3
+[terrain]
+source = "none.tif"
+[cost]
+max_climb_deg = 9
+top_speed_m_per_s = 0.1
+[network]
+connect = ["tcp/127.0.0.1:9"]
+[vehicles]
+sensor = "nowhere:Eyes"
+[monitor]
+show_target = "t9"
+[[targets]]
+name = "t"
+[[groups]]
+targets = ["x"]
+vehicles = 1
+cells = [[1, 1], [2, 2]]
+"""
+FAULTS = {
+    "seed": "", "unknown key secnds": "", "cost.top_speed_m_per_s": "", "cost.max_climb_deg": "cost.directional",
+    "groups: all chases 'x'": "targets[0].name", "monitor.show_target": "targets[0].name",
+    "network.connect": "network.listen", "vehicles.sensor": "vehicles.sensr", "terrain.source": "",
+    "groups[0].cells": "groups[0].vehicles",
+}  # fmt: skip
+"""Fault of `SEVERAL` -> a key with which it could not be known."""
+
+
+def told(swarm: Swarm, words: str, text: str) -> list[str]:
+    Path("s.toml").write_text(text)
+    code, out, err = swarm(words)
+    assert code == 2 or (words, code) == ("check s.toml", 1)
+    lines = (out or err).removeprefix("swarm: ").splitlines()
+    return [line.removeprefix("failure: ").removeprefix("s.toml: ") for line in lines]
+
+
+def test_contradictions_are_said_beside_other_faults_unless_they_may_come_of_them(swarm: Swarm) -> None:
+    lines = told(swarm, "check s.toml", SEVERAL)
+    for fault, line in zip([*FAULTS, "10 failures"], lines, strict=True):
+        assert line.startswith(fault)
+    for key in filter(None, FAULTS.values()):
+        section, _, name = key.removesuffix("]").rpartition(".")
+        head = f"[[{section.removesuffix('[0]')}]]" if "[0]" in section else f"[{section}]"
+        kept = [line for line in SEVERAL.splitlines(True) if not line.startswith(f"{name} =")]
+        again = "".join(kept).replace(head, f"{head}\n{name} = 1.5")
+        lines = told(swarm, "check s.toml", again)
+        gone = {fault for fault, reason in FAULTS.items() if reason == key}
+        assert not any(line.startswith(fault) for line in lines for fault in gone)
+        assert all(any(line.startswith(fault) for line in lines) for fault in FAULTS.keys() - gone), lines
+
+
+def test_a_run_says_all_at_once_as_well(swarm: Swarm) -> None:
+    lines = told(swarm, "up s.toml", SEVERAL)
+    assert len(lines) == 6
+    assert all(line.startswith(fault) for fault, line in zip(FAULTS, lines, strict=False))
+    rest = SEVERAL.partition("[terrain]")[2].replace("[cost]\nmax_climb_deg = 9\ntop_speed_m_per_s = 0.1\n", "")
+    rest = rest.replace('targets = ["x"]', "").replace('show_target = "t9"', "")
+    lines = told(swarm, "up s.toml", f"[terrain]{rest}")
+    assert [line.split(": ")[1] for line in lines] == ["groups[0].cells", "terrain.source", "network.connect"]
 
 
 CELLS = st.tuples(st.integers(-1, 6), st.integers(-1, 6))

@@ -48,19 +48,7 @@ def test_no_role_imports_for_itself_what_all_of_its_kind_need() -> None:
     assert imported == []
 
 
-def test_what_one_process_or_none_needs_is_not_loaded_for_all() -> None:
-    loaded = json.loads(
-        _python(
-            "import json, sys\nimport launch_scripts.launcher.preloaded\n"
-            "print(json.dumps(sorted({name.partition('.')[0] for name in sys.modules})))"
-        )
-    )
-    assert "numba" in loaded
-    assert {"rerun", "rasterio", "matplotlib", "PIL", "pyarrow", "typer"}.isdisjoint(loaded)
-
-
 _LAUNCHER = """
-import json, sys
 import numpy as np
 import launch_scripts.cli
 from launch_scripts.launcher import up
@@ -68,14 +56,35 @@ from launch_scripts.simulation.sample_worlds import crowd
 
 scenario, terrain = crowd("open", 1, 8, 4)
 up.check_places(scenario, terrain, terrain.pace_s_per_m, np.isfinite(terrain.pace_s_per_m))
-print(json.dumps(sorted({name.partition(".")[0] for name in sys.modules})))
 """
+_PROBE = """
+import sys
+from launch_scripts.entry import main
+
+sys.argv = ["swarm", "health", "--url", "http://127.0.0.1:1"]
+assert main() == 4
+"""
+_LARGE = {"rerun", "rasterio", "matplotlib", "PIL", "pyarrow"}
+_OF_PROBES = {"typer", "click", "rich", "numpy", "msgspec", "zenoh", "asyncio", "http", "email", "ssl", "numba"}
 
 
-def test_a_launcher_checks_a_prepared_terrain_without_a_library_that_is_large() -> None:
-    loaded = json.loads(_python(_LAUNCHER))
-    assert "numpy" in loaded
-    assert {"scipy", "numba", "rerun", "rasterio", "matplotlib", "PIL", "pyarrow"}.isdisjoint(loaded)
+@pytest.mark.parametrize(
+    ("code", "needed", "left_out"),
+    [
+        ("import launch_scripts.cli", {"typer"}, {"zenoh", "numpy"}),
+        ("import launch_scripts.launcher.preloaded", {"numba"}, {"typer", *_LARGE}),
+        (_LAUNCHER, {"numpy"}, {"scipy", "numba", *_LARGE}),
+        (_PROBE, {"socket"}, _OF_PROBES),
+    ],
+    ids=["help", "the fork server", "a launcher that checks a prepared terrain", "a probe"],
+)
+def test_what_is_large_is_not_loaded_where_it_is_not_needed(
+    code: str, needed: set[str], left_out: set[str]
+) -> None:
+    shown = "\nimport json, sys\nprint(json.dumps([name.partition('.')[0] for name in sys.modules]))"
+    loaded = set(json.loads(_python(code + shown).splitlines()[-1]))
+    assert needed <= loaded
+    assert left_out.isdisjoint(loaded)
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ import pytest
 from support.simulated import simulate
 from support.small_study import STUDY, write_study
 
-from launch_scripts.commands.simulation_commands import sweep_study
+from launch_scripts.commands.simulation_commands import run as run_study
 from launch_scripts.simulation import study as statistics
 from launch_scripts.simulation.laws import BrokenLaw
 from launch_scripts.simulation.simulate import Simulation
@@ -253,11 +253,11 @@ def test_a_trial_that_broke_a_law_is_told_with_the_command_that_runs_it_again(tm
 def test_the_command_prints_what_is_kept_and_says_by_its_result_whether_all_laws_held(tmp_path, capsys):
     path, out = write_study(tmp_path), tmp_path / "out"
     sweep, _ = finished(path, out, {0: 1.0, 1: 2.0, 2: 6.0})
-    assert sweep_study(str(path), None, 1, out, as_json=True)
+    assert run_study(str(path), None, 1, out, as_json=True) == 0
     told = json.loads(capsys.readouterr().out)
     assert told["cases"][0]["outcomes"]["captures"]["values"] == {"0": 1.0, "1": 2.0, "2": 6.0}
     sweep.store.add(result_of(sweep.cases[0].trials[1], (BrokenLaw("l", "it broke", 1.0),), captures=2.0))
-    assert not sweep_study(str(path), None, 1, out, as_json=False)
+    assert run_study(str(path), None, 1, out, as_json=False) == 1
     shown = capsys.readouterr()
     assert "6 of 6 trials are kept from before" in shown.err
     assert "sense_range_m = 120" in shown.out
@@ -299,5 +299,5 @@ def test_a_stop_that_interrupts_nothing_stops_a_sweep_after_the_trial(
 
     monkeypatch.setattr(Sweep, "run", run)
     with pytest.raises(KeyboardInterrupt):
-        sweep_study(str(write_study(tmp_path)), None, 1, tmp_path / "out", as_json=False)
+        run_study(str(write_study(tmp_path)), None, 1, tmp_path / "out", as_json=False)
     assert len(told_of) == 2

@@ -65,7 +65,7 @@ def test_a_scenario_which_version_0_2_wrote_is_read_under_the_names_of_today(cap
 def test_a_fault_of_cost_is_said_once_however_many_classes_have_it_from_there():
     for fault in ("frction = 1", "flat_speed_m_per_s = -1", "max_climb_deg = 9"):
         text = f"[cost]\n{fault}\n[[classes]]\nname = 'a'\n[[classes]]\nname = 'b'\ncost.vehicle_radius_m = 2"
-        assert len(read_scenario(text, "s")[1]) == 1
+        assert len(read_scenario(text, "s").faults) == 1
 
 
 def test_relative_files_lie_beside_the_scenario(tmp_path):
