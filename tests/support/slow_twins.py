@@ -48,7 +48,7 @@ def steps(
     return found
 
 
-def _legal_steps(
+def legal_steps(
     pace: NDArray[np.float32], neighbours: int, corner_cutting: bool
 ) -> Iterator[tuple[int, Cells, Cells]]:
     """For each direction: the cells from which a step leads there, and the cells to which it leads."""
@@ -82,7 +82,7 @@ def cost_to_go(
     left_share     share of a step that has the pace of the cell which it leaves: half of it in GRASS, none in ours
     """
     into, out, costs = [], [], []
-    for direction, here, there in _legal_steps(pace, neighbours, corner_cutting):
+    for direction, here, there in legal_steps(pace, neighbours, corner_cutting):
         length = step_length(direction, edge)
         left, entered = (pace.reshape(-1)[cells].astype(np.float64) for cells in (here, there))
         cost = (left_share * left + (1 - left_share) * entered) * length
@@ -112,7 +112,7 @@ def cost_to_go_in_float32(
     cell_cost  float32 (rows, cols), s; of the cheapest straight step into each cell
     """
     into: list[list[tuple[int, np.float32]]] = [[] for _ in range(cell_cost.size)]
-    for direction, out, to in _legal_steps(cell_cost, neighbours, corner_cutting):
+    for direction, out, to in legal_steps(cell_cost, neighbours, corner_cutting):
         prices = np.full(to.size, step_length(direction, edge), np.float32)
         if climb is not None:
             prices *= climb.along(out, to) / np.float32(climb.lowest)
