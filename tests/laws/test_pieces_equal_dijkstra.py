@@ -4,6 +4,7 @@ parents."""
 import os
 import subprocess
 import sys
+from dataclasses import replace
 from unittest import mock
 
 import numpy as np
@@ -24,6 +25,7 @@ from planner_service.tree.partitioned_tree import PartitionedTree
 from swarm.config.scenario import PlannerConfig
 from swarm.config.setting_types import Strategy
 from swarm.grid import GridSpec, Window
+from swarm.wire.route_columns import OK, RouteBatch
 
 FINE = 1e-11
 """Relative. A step may leave a cost 2**-46 too high, and float64 rounds."""
@@ -133,12 +135,10 @@ class Chase:
         walks = self.ground.walk(self.tree.parent, root, starts[some], 0, self.ground.cell_cost)
         assert (walks.ends >= 0).all(), "a cycle, or a hole"
         np.testing.assert_allclose(walks.driven, cost[given][some], rtol=FINE)
-        end = 0
-        for start, stop in zip(starts[some][:20], walks.ends[:20], strict=True):
-            cell = int(unpadded(self.ground, np.array([start]))[0])
-            steps = walks.directions[end:stop].tobytes()
-            assert naive.follow(self.pace, cell, steps, **self.rules) is not None, "a step that no rule allows"
-            end = stop
+        begun = RouteBatch.none(unpadded(self.ground, starts[some]), OK)
+        routes = replace(begun, directions=walks.directions, ends=walks.ends)
+        driven = naive.drive(self.ground.grid, PlannerConfig(**self.rules), self.pace, None, routes)
+        assert (driven.last == self.tree.root).all(), "a step that no rule allows"
 
 
 def chases(seeds: range, most: int, happenings: int) -> int:

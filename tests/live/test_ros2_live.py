@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 import zenoh
-from support.far_processes import Far
+from support.far_processes import NAMESPACE, Far, on_free_port
 from support.live_swarm import SWARM, LiveSwarm
 from support.made_up_swarm import swarm_peer
 from support.processes import eventually
@@ -22,7 +22,6 @@ from launch_scripts.gateways.ros2.gateway_settings import ROWS
 from launch_scripts.gateways.ros2.rmw import Qos
 from launch_scripts.gateways.ros2.ros_node import open_ros
 from launch_scripts.gateways.ros2.ros_types import types_of
-from launch_scripts.ports import free_ports
 from swarm.bus.zenoh_bus import open_bus
 from swarm.config.scenario import NetworkConfig
 
@@ -145,13 +144,13 @@ def made_up_swarm(network: NetworkConfig, run_id: str) -> Iterator[None]:
         yield
 
 
-def bench_gateway(endpoint: str, port: int, folder: Path) -> Gateway:
-    return Gateway(endpoint, f"tcp/127.0.0.1:{port}", folder, "--namespace", "bench", "--runs", folder)
+def gateway_of(network: NetworkConfig, port: int, folder: Path) -> Gateway:
+    words = ("--namespace", network.namespace, "--runs", folder)
+    return Gateway(network.connect[0], f"tcp/127.0.0.1:{port}", folder, *words)
 
 
 def test_a_foreign_stack_hears_every_type(tmp_path: Path, definitions: Path) -> None:
-    endpoint = f"tcp/127.0.0.1:{free_ports(1)[0]}"
-    network = NetworkConfig(namespace="bench", listen=(endpoint,), connect=(endpoint,))
+    network = on_free_port(NAMESPACE)
     with ExitStack() as ends:
         ends.enter_context(made_up_swarm(network, "bench"))
         port = ends.enter_context(ros_router())
@@ -159,7 +158,7 @@ def test_a_foreign_stack_hears_every_type(tmp_path: Path, definitions: Path) -> 
         # Before the gateway starts: the SDK does not ask for latched messages.
         for row in OUT:
             peer.hear(topic_of(row), ROWS[row].type_name)
-        ends.enter_context(bench_gateway(endpoint, port, tmp_path))
+        ends.enter_context(gateway_of(network, port, tmp_path))
         eventually(lambda: all(peer.heard[topic_of(row)] for row in OUT), 40, "a message of each topic")
         pose = peer.heard[topic_of("pose")][-1]
         assert pose["header"]["frame_id"] == "map"
@@ -173,12 +172,11 @@ def test_a_foreign_stack_hears_every_type(tmp_path: Path, definitions: Path) -> 
 
 
 def test_either_side_may_go_and_come_back_and_the_next_run_is_told_as_well(tmp_path: Path) -> None:
-    endpoint = f"tcp/127.0.0.1:{free_ports(1)[0]}"
-    network = NetworkConfig(namespace="bench", listen=(endpoint,), connect=(endpoint,))
+    network = on_free_port(NAMESPACE)
     with ExitStack() as ends:
         with made_up_swarm(network, "first"):
             with ros_router() as port:
-                gateway = ends.enter_context(bench_gateway(endpoint, port, tmp_path))
+                gateway = ends.enter_context(gateway_of(network, port, tmp_path))
                 poses_heard(port, 40)
             eventually(lambda: "the ROS router" in gateway.said, 15, "the word about the router that is gone")
             with ros_router(port):

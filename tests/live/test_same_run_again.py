@@ -11,7 +11,7 @@ from pathlib import Path
 import msgspec
 import pytest
 from support.live_swarm import LiveSwarm, swarm
-from support.processes import eventually, session_of
+from support.processes import eventually, in_session
 
 from launch_scripts.launcher.run_options import find_scenario
 
@@ -38,7 +38,7 @@ def test_a_launcher_that_is_killed_and_started_again_with_its_run_id_goes_on_wit
         os.kill(first.pid_of("planner-t0"), signal.SIGSTOP)  # which notices nothing
         kill(first.process.pid, signal.SIGKILL)  # with it or after it all that it started ends
         first.process.wait(10)
-        eventually(lambda: not session_of(first.process.pid), 10, "the end of all")
+        eventually(lambda: not in_session(first.process.pid), 10, "the end of all")
         before = sets_in(store)
     finally:
         first.kill()

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 from support.live_swarm import SWARM, LiveSwarm, client
-from support.processes import eventually, session_of
+from support.processes import eventually, in_session
 
 from swarm.bus.bus import Event, Heard, Replied
 from swarm.bus.endpoints import listening
@@ -90,7 +90,7 @@ def machine(live: LiveSwarm, folder: Path) -> Iterator[subprocess.Popen[bytes]]:
     try:
         yield launcher
     finally:
-        if session_of(launcher.pid):
+        if in_session(launcher.pid):
             os.killpg(launcher.pid, signal.SIGKILL)
         launcher.wait(10)
 

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
-from support.processes import eventually, session_of
+from support.processes import eventually, in_session
 
 from launch_scripts.ports import free_ports
 from swarm.bus.bus import AskEnded, Replied
@@ -131,7 +131,7 @@ class LiveSwarm:
 
     def kill(self) -> None:
         """For the end of a test that failed."""
-        if session_of(self.process.pid):
+        if in_session(self.process.pid):
             os.killpg(self.process.pid, signal.SIGKILL)
         self.process.wait(10)
 

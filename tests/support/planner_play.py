@@ -29,7 +29,10 @@ _MARKED = np.array([np.inf, 0.5, 1.0, 20.0, 500.0, PACE_LEAST, PACE_MOST], np.fl
 class Play:
     """A tree, its map, and the job that a worker may have of it.
 
+    grid        of the map; cells of a metre by default
+    target      where the target begins; by default on the first passable cell
     has_worker  long growths are left to that job: until it is adopted, answers are about where the target was
+    in_pieces   the tree lies in pieces, as if the map were large
     """
 
     def __init__(
@@ -41,14 +44,18 @@ class Play:
         has_worker: bool = False,
         chosen_by: Strategy | None = None,
         climb: Climb | None = None,
+        grid: GridSpec | None = None,
+        target: int | None = None,
+        in_pieces: bool = False,
     ) -> None:
         self.pace = pace
         self.config = config
-        self.grid = GridSpec(*pace.shape, 1.0)
+        self.grid = grid or GridSpec(*pace.shape, 1.0)
         self.tree = TargetTree(self.grid, config, climb, all_kernels, has_worker=has_worker, chosen_by=chosen_by)
+        self.tree.times.in_pieces |= in_pieces
         self.has_worker = has_worker
         self.version = 0
-        self.target = int(np.flatnonzero(np.isfinite(pace))[0])
+        self.target = int(np.flatnonzero(np.isfinite(pace))[0]) if target is None else target
         self.grown: GrownTree | None = None
         self.search: Callable[[], StrideNetwork] | None = None
         self.since: list[Window] = []

@@ -1,23 +1,13 @@
-"""Live processes, by the session that a test started them in: names would match those of others, too."""
+"""Processes of this machine, by the session that a test started them in: names would match those of others, too."""
 
 from __future__ import annotations
 
-import contextlib
 import os
 import time
 from collections.abc import Callable
+from typing import NamedTuple
 
 import psutil
-from support.process_usage import in_session
-
-
-def session_of(leader: int) -> list[str]:
-    """Command lines of the living processes of a session."""
-    lines = []
-    for pid in in_session(leader):
-        with contextlib.suppress(psutil.Error):  # ended while we looked
-            lines.append(" ".join(psutil.Process(pid).cmdline()))
-    return lines
 
 
 def eventually(
@@ -33,3 +23,55 @@ def eventually(
         waited_s, a_core = time.monotonic() - began_s, os.getloadavg()[0] / (os.cpu_count() or 1)
         assert waited_s < within_s * max(1.0, a_core), f"{what} did not come true within {waited_s:.0f} s"
         time.sleep(every_s)
+
+
+class Usage(NamedTuple):
+    """Resource use of one process."""
+
+    rss_bytes: int
+    threads: int
+    files: int
+
+
+def usage(pid: int) -> Usage | None:
+    """Current resource use of a process; None if it has ended."""
+    try:
+        process = psutil.Process(pid)
+        return Usage(process.memory_info().rss, process.num_threads(), process.num_fds())
+    except psutil.Error:
+        return None
+
+
+def in_session(session: int) -> list[int]:
+    """The living processes of a session, such as a launcher's with all that it started."""
+    found = []
+    for process in psutil.process_iter():
+        try:
+            if os.getsid(process.pid) == session and process.status() != psutil.STATUS_ZOMBIE:
+                found.append(process.pid)
+        except (psutil.Error, OSError):  # ended meanwhile
+            continue
+    return found
+
+
+def cpu_s(pid: int) -> float | None:
+    """Seconds of CPU that a process has used, its own and the system's; None if it has ended."""
+    try:
+        times = psutil.Process(pid).cpu_times()
+    except psutil.Error:
+        return None
+    return float(times.user + times.system)
+
+
+def machine_cpu_s() -> float:
+    """Seconds of CPU that all processes of the machine have used, and that its host took."""
+    times = psutil.cpu_times()
+    return float(sum(times) - times.idle - times.iowait - times.guest - times.guest_nice)
+
+
+def pss_bytes(pid: int) -> int | None:
+    """Memory of a process, of which shared pages count for their share; None if it has ended or may not be seen."""
+    try:
+        return int(psutil.Process(pid).memory_full_info().pss)
+    except psutil.Error:
+        return None

@@ -169,32 +169,6 @@ def way_down(pace: NDArray[np.float32], cost: NDArray[np.float64], start: int, m
     return bytes(directions)
 
 
-def follow(
-    pace: NDArray[np.float32],
-    start: int,
-    directions: bytes,
-    neighbours: int = 8,
-    edge: str = "octile",
-    corner_cutting: bool = False,
-) -> tuple[int, float] | None:
-    """(last cell, cost) of a route on cells of one metre; None if it breaks a rule on the way."""
-    rows, cols = pace.shape
-    row, col = divmod(start, cols)
-    total = 0.0
-    for direction in directions:
-        r, c = row + STEP_ROW[direction], col + STEP_COL[direction]
-        if not (0 <= r < rows and 0 <= c < cols) or pace[r, c] == math.inf:
-            return None
-        if direction % 2:
-            if neighbours == 4:
-                return None
-            if not corner_cutting and (pace[row, c] == math.inf or pace[r, col] == math.inf):
-                return None
-        total += float(pace[r, c]) * step_length(direction, edge)
-        row, col = r, c
-    return row * cols + col, total
-
-
 class Driven(NamedTuple):
     """The outcome of routes that were driven step by step.
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 import time
 from collections.abc import Iterable
 from contextlib import closing
@@ -11,7 +10,7 @@ from typing import Any
 
 import numpy as np
 import zenoh
-from support.far_processes import Far, asked
+from support.far_processes import Far, answered, asked
 from support.made_up_swarm import some_fleet
 
 from bench.wire.remote import RAW, Parts, beside, read_on_thread, run_service
@@ -217,7 +216,9 @@ def positions(far: Far, agents: int, vehicles: int, seconds: float) -> dict[str,
     for name, raw in (("raw", True), ("ours", False)):
         before = asked(watcher, "counts")
         began_s = time.monotonic()
-        sent = sum(_all_answers(senders, (raw, seconds), seconds))
+        for sender in senders:
+            sender.send((raw, seconds))
+        sent = sum(answered(sender, "the question for positions", seconds + _LONGEST_S) for sender in senders)
         time.sleep(0.3)
         took_s = time.monotonic() - began_s - 0.3
         received, superseded, raw_count, cpu_ns = (
@@ -234,19 +235,3 @@ def positions(far: Far, agents: int, vehicles: int, seconds: float) -> dict[str,
         far.end()
     figures["ratio_cpu_ms_per_s"] = figures["ours_cpu_ms_per_s"] / figures["raw_cpu_ms_per_s"]
     return {name: round(float(value), 2) for name, value in figures.items()}
-
-
-def _all_answers(pipes: list[Connection], question: Any, seconds: float) -> list[int]:
-    answers: dict[int, int] = {}
-
-    def ask(n: int) -> None:
-        answers[n] = asked(pipes[n], *question, within_s=seconds + _LONGEST_S)
-
-    threads = [threading.Thread(target=ask, args=(n,)) for n in range(len(pipes))]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    if len(answers) < len(pipes):
-        raise SwarmError("a process that tells positions did not answer")
-    return list(answers.values())

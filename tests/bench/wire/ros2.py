@@ -10,14 +10,12 @@ from typing import Annotated, Any
 
 import psutil
 import typer
-from support.far_processes import Far
+from support.far_processes import Far, on_free_port
 from support.made_up_swarm import swarm_peer
 from support.ros_peer import Gateway
 
 from bench.harness import benchmark, track
-from launch_scripts.ports import free_ports
 from swarm.bus.zenoh_bus import open_bus
-from swarm.config.scenario import NetworkConfig
 
 _WARM_S = 3.0
 _LASTS_S = 120.0
@@ -38,15 +36,14 @@ def ros2(
     """
     from launch_scripts.gateways.ros2.ros_node import open_ros
 
-    endpoint = f"tcp/127.0.0.1:{free_ports(1)[0]}"
-    ros_side = NetworkConfig(namespace="ros", listen=(endpoint,), connect=(endpoint,))
+    ros_side = on_free_port("ros")
     heard: Counter[str] = Counter()
     with Far() as far, open_bus(ros_side, mode="router"), tempfile.TemporaryDirectory() as folder:
         far.start(swarm_peer, vehicles, _LASTS_S + seconds)
-        with open_ros(endpoint) as hearer:
+        with open_ros(ros_side.connect[0]) as hearer:
             subscriber = hearer.declare_subscriber("0/**", lambda sample: heard.update([str(sample.key_expr)]))
             words = ("--namespace", "bench", "--runs", folder)
-            with Gateway(far.network.connect[0], endpoint, Path(folder), *words) as begun:
+            with Gateway(far.network.connect[0], ros_side.connect[0], Path(folder), *words) as begun:
                 time.sleep(_WARM_S)
                 before, gateway = heard.copy(), psutil.Process(begun.process.pid)
                 used, began_s = gateway.cpu_times(), time.monotonic()
