@@ -23,7 +23,7 @@ from swarm.config.scenario import PlannerConfig
 from swarm.grid import walk
 from swarm.runtime.stats import Counters
 from swarm.wire.messages.map_data import MarkKind
-from swarm.wire.messages.planning import PushedRoute, RouteReply, RouteRequest, TargetPose
+from swarm.wire.messages.planning import PushedRoute, RouteReply, RouteRequest
 from swarm.wire.route_columns import Route, RouteBatch, RouteStatus
 
 SIDE = 24
@@ -141,10 +141,9 @@ class Searched(Watched):
         self.planner = Planner(self.watch, 7, config, tree, self.map, Counters(), target_search=search)
         if seed % 2:  # seen once; else never
             cell = int(self.rng.choice(np.flatnonzero(np.isfinite(self.map.pace_s_per_m))))
-            x_m, y_m = grid.centre_m(cell)
-            seen = TargetPose(target="t0", incarnation=1, seq=1, stamp_ns=0, cell=cell, x_m=x_m, y_m=y_m)
+            seen = target_pose("t0", cell, grid)
             self.watch.on_sighting(seen, 0)
-            east_m, south_m = np.array([x_m - grid.west_m]), np.array([grid.north_m - y_m])
+            east_m, south_m = np.array([seen.x_m - grid.west_m]), np.array([grid.north_m - seen.y_m])
             search.hear_vehicles(east_m.astype(np.float32), south_m.astype(np.float32))
         while not search.active:
             self.now_ns += TICK

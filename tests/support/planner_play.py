@@ -50,7 +50,8 @@ class Play:
     ) -> None:
         self.pace = pace
         self.config = config
-        self.grid = grid or GridSpec(*pace.shape, 1.0)
+        rows, cols = pace.shape
+        self.grid = grid or GridSpec(rows, cols, 1.0)
         self.tree = TargetTree(self.grid, config, climb, all_kernels, has_worker=has_worker, chosen_by=chosen_by)
         self.tree.times.in_pieces |= in_pieces
         self.has_worker = has_worker
@@ -99,7 +100,7 @@ class Play:
     def walk(self, rng: np.random.Generator, steps: int, check_every: int) -> set[str]:
         """Moves to random neighbours, with marks and a worker's growths now and then. Returns the kind of
         growth."""
-        kinds = set()
+        kinds: set[str] = set()
         for step in range(steps):
             self.happen(Move(int(rng.integers(-1, 2)), int(rng.integers(-1, 2))))
             kinds.add(self.last.kind)
@@ -168,8 +169,7 @@ class Play:
         last, seconds = naive.drive(self.grid, self.config, self.pace, self.rules["climb"], routes)
         assert (last[cells] == target).all(), "a route enters a lethal cell, squeezes or leaves the grid"
         driven = seconds[cells]
-        cost = np.array([routes[cell].cost_s for cell in cells])
-        bound = np.array([routes[cell].lower_bound_s for cell in cells])
+        cost, bound = routes.cost_s[cells], routes.lower_bound_s[cells]
         upper = self.tree.cost_to_go_at(cells)
         best = optimum[cells]
         np.testing.assert_allclose(cost, driven, rtol=1e-6)

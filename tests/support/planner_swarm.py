@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from support.makers import target_pose
 from support.scripted_planner import chasers
 from support.slow_twins import cost_to_go
 from support.swarm_model import SwarmModel
@@ -25,7 +26,7 @@ from swarm.config.setting_types import Strategy
 from swarm.grid import GridSpec, walk
 from swarm.wire.messages import Message
 from swarm.wire.messages.map_data import MarkKind
-from swarm.wire.messages.planning import RouteReply, RouteRequest, TargetPose
+from swarm.wire.messages.planning import RouteReply, RouteRequest
 from swarm.wire.messages.processes import Stats
 from swarm.wire.route_columns import Route
 from swarm.wire.topics import CHASERS, POSE, PUSHED_ROUTE, ROUTE, STATS, STATUS, Topic
@@ -140,8 +141,7 @@ class Swarm(SwarmModel):
         """Ten poses a second of every target that has been put somewhere."""
         self._seq += 1
         for id, cell in self.cells.items():
-            pose = TargetPose(target=id, incarnation=1, seq=self._seq, stamp_ns=0, cell=cell, x_m=0, y_m=0)
-            self.ear.bus.publish(POSE, pose, target=id)
+            self.ear.bus.publish(POSE, target_pose(id, cell, seq=self._seq), target=id)
         self.scheduler.after(TICK, self._track)
 
     def mark(self, *cells: int, kind: MarkKind = MarkKind.LETHAL, pace: float = 0.0) -> None:

@@ -12,6 +12,7 @@ import numpy as np
 import zenoh
 from support.far_processes import Far, answered, asked
 from support.made_up_swarm import some_fleet
+from support.makers import target_pose
 
 from bench.wire.remote import RAW, Parts, beside, read_on_thread, run_service
 from planner_service.planning_process import Planning
@@ -25,7 +26,7 @@ from swarm.runtime.inbox import Inbox
 from swarm.runtime.process import ThreadWorker
 from swarm.runtime.role_setup import RoleSetup
 from swarm.wire.codec import encode
-from swarm.wire.messages.planning import RouteReply, RouteRequest, TargetPose
+from swarm.wire.messages.planning import RouteReply, RouteRequest
 from swarm.wire.messages.vehicles import Fleet
 from swarm.wire.route_columns import RouteStatus
 from swarm.wire.topics import FLEET, POSE, ROUTE
@@ -127,7 +128,7 @@ def _raw_ns(bus: ZenohBus, payload: bytes, size: int) -> int | None:
 def _wait_for_route(bus: ZenohBus, inbox: Inbox) -> None:
     deadline_s = time.monotonic() + _LONGEST_S
     cell = _SIDE * _SIDE // 2 + _SIDE // 2
-    pose = TargetPose(target=_TARGET, incarnation=1, seq=1, stamp_ns=time.time_ns(), cell=cell, x_m=0.0, y_m=0.0)
+    pose = target_pose(_TARGET, cell, stamp_ns=time.time_ns())
     while time.monotonic() < deadline_s:
         bus.publish(POSE, pose, target=_TARGET)
         reply = ask_route(bus, inbox, RouteRequest(cells=[0]))
@@ -181,7 +182,7 @@ def fleet_sender(network: NetworkConfig, pipe: Connection, first: int, vehicles:
 
 def _fleet(agent: int, seq: int, vehicles: int) -> Fleet:
     places = np.linspace(0.0, 1000.0, vehicles) + seq
-    return some_fleet(f"a{agent}", agent, seq, places, places, places, [_TARGET])
+    return some_fleet(f"a{agent}", agent, seq, places, places, places, _TARGET)
 
 
 def watcher_peer(network: NetworkConfig, pipe: Connection) -> None:
