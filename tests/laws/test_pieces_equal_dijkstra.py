@@ -1,9 +1,6 @@
 """A tree of pieces after any moves, jumps and marks: its costs equal scipy's and the cost of driving along the
 parents."""
 
-import os
-import subprocess
-import sys
 from dataclasses import replace
 from unittest import mock
 
@@ -162,24 +159,6 @@ def test_random_chases() -> None:
 @pytest.mark.thorough
 def test_many_random_chases() -> None:
     assert chases(range(1000, 1300), 260, 12) < 1200
-
-
-@pytest.mark.parametrize(
-    ("how", "count"),
-    [("NUMBA_DISABLE_JIT", 2), pytest.param("NUMBA_BOUNDSCHECK", 40, marks=pytest.mark.thorough)],
-)
-def test_slow_twin(how: str, count: int) -> None:
-    """Uncompiled, and with every index checked, the kernels do the same."""
-    program = f"from laws.test_pieces_equal_dijkstra import chases; chases(range({count}), 40, 3)"
-    paths = os.pathsep.join(path for path in sys.path if path)
-    done = subprocess.run(
-        [sys.executable, "-W", "ignore", "-c", program],
-        env={**os.environ, how: "1", "PYTHONPATH": paths},
-        capture_output=True,
-        text=True,
-        timeout=300,
-    )
-    assert done.returncode == 0, done.stderr
 
 
 @pytest.mark.parametrize(("strategy", "has_worker"), [("exact", False), ("exact", True), ("auto", False)])
