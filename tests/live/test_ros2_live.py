@@ -96,11 +96,11 @@ def test_a_latched_map_comes_to_who_comes_late(gateway: Gateway, session: zenoh.
 def test_a_peer_of_another_domain_or_distribution_is_logged(gateway: Gateway, session: zenoh.Session) -> None:
     elsewhere = PeerNode(session, "far", TYPES, domain=7)
     elsewhere.subscribe("/map", ROWS["map"].type_name, lambda message: None)
-    eventually(lambda: "node far subscribes to /map in domain 7" in gateway.said, 15, "the word about a domain")
+    eventually(lambda: "node far subscribes to /map in domain 7" in gateway.text, 15, "the word about a domain")
     elsewhere.close()
     older = PeerNode(session, "old", types_of("humble"))
     older.subscribe("/map", ROWS["map"].type_name, lambda message: None)
-    eventually(lambda: "node old subscribes to /map as humble does" in gateway.said, 15, "the word about humble")
+    eventually(lambda: "node old subscribes to /map as humble does" in gateway.text, 15, "the word about humble")
     older.close()
 
 
@@ -116,8 +116,8 @@ def test_after_kill_9_of_the_gateway_nothing_of_it_is_left(gateway: Gateway, ses
 
 def test_the_gateway_ends_at_ctrl_c_and_says_what_it_lacks(gateway: Gateway, live: LiveSwarm) -> None:
     gateway.process.send_signal(2)
-    assert gateway.process.wait(40) == 0, gateway.said
-    assert "Traceback" not in gateway.said
+    assert gateway.process.wait(40) == 0, gateway.text
+    assert "Traceback" not in gateway.text
     alone = subprocess.run(
         [*SWARM, "gateway", "ros2", "--connect", live.endpoint, "--ros", "tcp/127.0.0.1:9"],
         capture_output=True, text=True, timeout=60, check=False,
@@ -178,12 +178,12 @@ def test_either_side_may_go_and_come_back_and_the_next_run_is_told_as_well(tmp_p
             with ros_router() as port:
                 gateway = ends.enter_context(gateway_of(network, port, tmp_path))
                 poses_heard(port, 40)
-            eventually(lambda: "the ROS router" in gateway.said, 15, "the word about the router that is gone")
+            eventually(lambda: "the ROS router" in gateway.text, 15, "the word about the router that is gone")
             with ros_router(port):
                 poses_heard(port, 20)
         ends.enter_context(ros_router(port))
         ends.enter_context(made_up_swarm(network, "second"))
-        eventually(lambda: "run second" in gateway.said, 40, "the next run")
+        eventually(lambda: "run second" in gateway.text, 40, "the next run")
         poses_heard(port, 20)
-        assert gateway.process.poll() is None, gateway.said
-        assert "Traceback" not in gateway.said
+        assert gateway.process.poll() is None, gateway.text
+        assert "Traceback" not in gateway.text

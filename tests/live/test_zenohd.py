@@ -120,8 +120,7 @@ def test_without_a_certificate_of_the_swarms_nobody_gets_in(tmp_path: Path) -> N
         files = TlsConfig(**dict(zip(("ca", "certificate", "key"), names, strict=True)))
         return NetworkConfig(listen=(endpoint,), connect=(endpoint,), tls=files, connect_timeout_s=2.0)
 
-    router = Zenohd(tmp_path, network(certs), plugins())
-    try:
+    with Zenohd(tmp_path, network(certs), plugins()):
         with open_bus(network(certs)):
             pass
         with pytest.raises(BusError, match="cannot reach a router"), open_bus(network(others)):
@@ -129,5 +128,3 @@ def test_without_a_certificate_of_the_swarms_nobody_gets_in(tmp_path: Path) -> N
         mixed = msgspec.structs.replace(network(others).tls, ca=str(certs / "ca.pem"))  # trusts, is not trusted
         with pytest.raises(BusError), open_bus(msgspec.structs.replace(network(others), tls=mixed)):
             pass
-    finally:
-        router.stop()

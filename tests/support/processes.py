@@ -2,12 +2,52 @@
 
 from __future__ import annotations
 
+import contextlib
 import os
+import re
+import signal
+import subprocess
 import time
 from collections.abc import Callable
-from typing import NamedTuple
+from pathlib import Path
+from typing import Any, NamedTuple, Self
 
 import psutil
+
+
+class Child:
+    """A process under way, of which all that it says is in a file. It is killed at the end of its context.
+
+    options  of Popen
+    """
+
+    def __init__(self, output: Path, *command: object, **options: Any) -> None:
+        self.output = output
+        with output.open("w") as file:
+            self.process = subprocess.Popen(list(map(str, command)), stdout=file, stderr=file, **options)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.kill()
+
+    @property
+    def text(self) -> str:
+        """All that it has said until now."""
+        return self.output.read_text()
+
+    def wait_for(self, pattern: str, within_s: float = 60.0) -> None:
+        found = re.compile(pattern, re.MULTILINE)
+        eventually(lambda: found.search(self.text), within_s, f"{pattern!r} in {self.output}")
+
+    def kill(self) -> None:
+        """Kills it, and whatever is in a session of its own."""
+        for pid in in_session(self.process.pid):
+            with contextlib.suppress(ProcessLookupError):
+                os.kill(pid, signal.SIGKILL)
+        self.process.kill()
+        self.process.wait(10)
 
 
 def eventually(

@@ -14,11 +14,11 @@ import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import zenoh
 from support.live_swarm import SWARM
-from support.processes import eventually
+from support.processes import Child, eventually
 
 from launch_scripts.gateways.ros2.ros_types import REQUEST, RESPONSE, RosTypes
 from launch_scripts.ports import free_ports
@@ -30,34 +30,21 @@ _LONGEST_S = 120.0
 _EMPTY = "uint8 structure_needs_at_least_one_member"
 
 
-class Gateway:
+class Gateway(Child):
     """`swarm gateway ros2` between the routers at two endpoints, as users start it. Use it in a `with`, which waits
     until it is in a run, and kills it in the end. Raises SwarmError, with what it said, if it does not start."""
 
     def __init__(self, swarm: str, ros: str, folder: Path, *words: object) -> None:
-        self._log = folder / "ros2.log"
-        command = [*SWARM, "gateway", "ros2", *words, "--connect", swarm, "--ros", ros]
-        with self._log.open("w") as log:
-            self.process = subprocess.Popen(list(map(str, command)), stdout=log, stderr=log)
+        where = ("--connect", swarm, "--ros", ros)
+        super().__init__(folder / "ros2.log", *SWARM, "gateway", "ros2", *words, *where)
 
-    @property
-    def said(self) -> str:
-        return self._log.read_text()
-
-    def __enter__(self) -> Gateway:
+    def __enter__(self) -> Self:
         with contextlib.suppress(AssertionError):
-            eventually(lambda: "run " in self.said or self.process.poll() is not None, _START_S)
-        if "run " not in self.said or self.process.poll() is not None:
+            eventually(lambda: "run " in self.text or self.process.poll() is not None, _START_S)
+        if "run " not in self.text or self.process.poll() is not None:
             self.kill()
-            raise SwarmError(f"the gateway does not start: {self.said.strip()}")
+            raise SwarmError(f"the gateway does not start: {self.text.strip()}")
         return self
-
-    def __exit__(self, *_: object) -> None:
-        self.kill()
-
-    def kill(self) -> None:
-        self.process.kill()
-        self.process.wait(10)
 
 
 @contextlib.contextmanager
