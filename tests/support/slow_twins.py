@@ -152,23 +152,6 @@ def cost_to_go_by_hand(pace: NDArray[np.float32], target: int, **rules: object) 
     return best.reshape(pace.shape)
 
 
-def way_down(pace: NDArray[np.float32], cost: NDArray[np.float64], start: int, most: int = 0) -> bytes:
-    """Directions of a cheapest route by the default rules to where cost is 0; `most` of them, if given."""
-    rows, cols = pace.shape
-    row, col = divmod(start, cols)
-    directions = bytearray()
-    while cost[row, col] > 0 and (not most or len(directions) < most):
-        best = (math.inf, 0, row, col)
-        for direction in range(8):
-            r, c = row + STEP_ROW[direction], col + STEP_COL[direction]
-            if not (0 <= r < rows and 0 <= c < cols) or math.inf in (pace[row, c], pace[r, col], pace[r, c]):
-                continue
-            best = min(best, (cost[r, c] + float(pace[r, c]) * step_length(direction, "octile"), direction, r, c))
-        _, direction, row, col = best
-        directions.append(direction)
-    return bytes(directions)
-
-
 class Driven(NamedTuple):
     """The outcome of routes that were driven step by step.
 
