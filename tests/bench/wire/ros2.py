@@ -19,7 +19,7 @@ from swarm.bus.zenoh_bus import open_bus
 
 _WARM_S = 3.0
 _LASTS_S = 120.0
-"""How long the swarm is there, beside the measurement."""
+"""Life of the swarm, beside the measurement."""
 
 
 @benchmark()
