@@ -56,10 +56,10 @@ OPEN = ["." * 20] * 20
 """A picture for `pace_of`: level ground without an obstacle."""
 
 
-def pace_of(picture: Sequence[str], pace: float = 0.1) -> NDArray[np.float32]:
+def pace_of(picture: Sequence[str]) -> NDArray[np.float32]:
     """Pace from a picture: '#' is lethal, '~' is three times as slow, anything else is level ground."""
-    values = {"#": math.inf, "~": 3 * pace}
-    return np.array([[values.get(sign, pace) for sign in line] for line in picture], np.float32)
+    values = {"#": math.inf, "~": 0.3}
+    return np.array([[values.get(sign, 0.1) for sign in line] for line in picture], np.float32)
 
 
 class FakePlanner:
@@ -133,9 +133,8 @@ class AgentWorld(SwarmModel):
         prior: NDArray[np.float32],
         truth: NDArray[np.float32] | None = None,
         links: LinkModel | None = None,
-        resolution_m: float = 10.0,
     ) -> None:
-        super().__init__(links, terrain_of_pace(prior, resolution_m), parse_scenario(scenario))
+        super().__init__(links, terrain_of_pace(prior, 10.0), parse_scenario(scenario))
         self.truth = np.array(self.terrain.ground_s_per_m if truth is None else truth, np.float32)
         self.agents: dict[str, AgentService] = {}
         self.stores: dict[str, PromiseStore] = {}

@@ -91,16 +91,16 @@ class Ear:
         self.world.run(0.01)
         return self.replies
 
-    def routes(self, *cells: int, target: str = "t", **fields: Any) -> RouteReply:
-        (reply,) = self.ask(ROUTE, RouteRequest(cells=list(cells), **fields), target=target)
+    def routes(self, *cells: int, **fields: Any) -> RouteReply:
+        (reply,) = self.ask(ROUTE, RouteRequest(cells=list(cells), **fields), target="t")
         assert isinstance(reply, RouteReply)
         return reply
 
     def of(self, kind: type[Any]) -> list[Any]:
         return [message for message in self.heard if isinstance(message, kind)]
 
-    def last_stats(self, role: str = "planner") -> Stats:
-        return [stats for stats in self.of(Stats) if stats.role == role][-1]  # type: ignore[no-any-return]
+    def last_stats(self) -> Stats:
+        return [stats for stats in self.of(Stats) if stats.role == "planner"][-1]  # type: ignore[no-any-return]
 
 
 def planning(world: SwarmModel, role: str, id: str, incarnation: int = 1) -> Callable[[MemoryBus, Post], Planning]:
@@ -147,6 +147,6 @@ class Swarm(SwarmModel):
     def mark(self, *cells: int, kind: MarkKind = MarkKind.LETHAL, pace: float = 0.0) -> None:
         self.author.sync.publish(self.author.replica.write(list(cells), kind, pace, self.now_ns))
 
-    def report(self, *vehicles: tuple[str, int], target: str = "t") -> None:
-        told = chasers(*vehicles, target=target, stamp_ns=self.now_ns)
-        self.ear.bus.publish(CHASERS, told, target=target, author=told.author)
+    def report(self, *vehicles: tuple[str, int]) -> None:
+        told = chasers(*vehicles, target="t", stamp_ns=self.now_ns)
+        self.ear.bus.publish(CHASERS, told, target="t", author=told.author)

@@ -195,10 +195,10 @@ def pose(cell: int, seq: int = 1, incarnation: int = 1, target: str = "t0") -> T
     return target_pose(target, cell, tracker="radar", seq=seq, incarnation=incarnation)
 
 
-def chasers(*vehicles: tuple[str, int], stamp_ns: int, target: str = "t0", author: str = "all.a0.1") -> Chasers:
+def chasers(*vehicles: tuple[str, int], stamp_ns: int, target: str = "t0") -> Chasers:
     return Chasers(
         target=target,
-        author=author,
+        author="all.a0.1",
         stamp_ns=stamp_ns,
         ids=[id for id, _ in vehicles],
         cells=pack_column([cell for _, cell in vehicles], "<u4"),
