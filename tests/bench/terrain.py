@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from support.height_models import written
 
 from bench.harness import benchmark, track
 from bench.isolated import isolated
@@ -54,7 +55,6 @@ def terrain(
 def _make(folder: Path, size: int, degrees: bool) -> None:
     """A synthetic landscape and its photo as tiled, deflated GeoTIFFs."""
     import numpy as np
-    import rasterio
     from rasterio.transform import from_origin
 
     from shared_map.terrain.synthetic import landscape, paint_photo
@@ -64,16 +64,11 @@ def _make(folder: Path, size: int, degrees: bool) -> None:
     step = RESOLUTION_DEG if degrees else RESOLUTION_M
     west, north = (8.0, 47.0) if degrees else (500_000, 5_200_000)
     common: dict[str, Any] = {
-        "driver": "GTiff",
-        "height": size,
-        "width": size,
         "crs": "EPSG:4326" if degrees else "EPSG:32632",
         "transform": from_origin(west, north, step, step),
         "tiled": True,
         "compress": "deflate",
         "zlevel": 1,
     }
-    with rasterio.open(folder / "dem.tif", "w", count=1, dtype="float32", **common) as file:
-        file.write(elevation_m, 1)
-    with rasterio.open(folder / "photo.tif", "w", count=3, dtype="uint8", photometric="rgb", **common) as file:
-        file.write(np.moveaxis(photo, 2, 0))
+    written(folder / "dem.tif", elevation_m, **common)
+    written(folder / "photo.tif", np.moveaxis(photo, 2, 0), "uint8", photometric="rgb", **common)

@@ -15,7 +15,7 @@ from typing import Annotated, Any
 import typer
 from bench.harness import Seed, benchmark, tell
 from support.message_fuzzer import NAMES, MessageFuzzer
-from support.process_usage import usage
+from support.processes import usage
 from support.up_process import UpProcess
 
 from chaos.attacker import Attacker

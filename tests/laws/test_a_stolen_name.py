@@ -5,12 +5,12 @@ More histories: `pytest tests/laws/test_a_stolen_name.py -m seeds --seeds 0:2000
 """
 
 import random
-from collections.abc import Callable
 from dataclasses import replace
 from functools import partial
 
 import msgspec
 import pytest
+from support.broken_rules import Broken, in_place_of
 from support.shard_tables import GRID, MEMBERS, holdings_of, standing
 from support.thief import Thief, ThiefWorld
 from support.traffic_world import Faults, Process, TrafficWorld, random_faults
@@ -22,7 +22,7 @@ from swarm.right_of_way.host_entries import HostEntries
 from swarm.right_of_way.shard_member import Member
 from swarm.right_of_way.shard_witness import Witness, _Host
 from swarm.right_of_way.shards import Shards
-from swarm.wire.messages.traffic import Fence, Held, HostState, Stand, Table, Word
+from swarm.wire.messages.traffic import Fence, Held, Stand, Table, Word
 
 LIES_S = 8.0
 SHAPES = ((4, 4, 8, 8), (5, 4, 9, 9), (6, 3, 12, 6), (4, 5, 8, 8))
@@ -98,47 +98,39 @@ def test_without_a_thief_all_move_although_members_judge_each_table(seed: int) -
 # --- the rules, each taken out ------------------------------------------------------------------------------
 
 
-def hosts_believe_one_leader(patch: pytest.MonkeyPatch) -> None:
-    hear = Holdings.hear_granted
-
-    def gullible(self: Holdings, granted, now_ns):  # type: ignore[no-untyped-def]
-        majority, self.shards.majority = self.shards.majority, 1
-        placed = hear(self, granted, now_ns)
-        self.shards.majority = majority
-        return placed
-
-    patch.setattr(Holdings, "hear_granted", gullible)
+@in_place_of(Holdings, "hear_granted")
+def hosts_believe_one_leader(hear, self, granted, now_ns):
+    majority, self.shards.majority = self.shards.majority, 1
+    placed = hear(self, granted, now_ns)
+    self.shards.majority = majority
+    return placed
 
 
-def members_store_whatever_a_leader_says(patch: pytest.MonkeyPatch) -> None:
-    patch.setattr(Witness, "accepts", lambda self, old, new: True)
+@in_place_of(Witness, "accepts")
+def members_store_whatever_a_leader_says(accepts, self, old, new):
+    return True
 
 
-def two_of_four_are_enough(patch: pytest.MonkeyPatch) -> None:
-    begin = Shards.__init__
-
-    def smaller(self: Shards, *what, **named):  # type: ignore[no-untyped-def]
-        begin(self, *what, **named)
-        self.majority = 2
-
-    patch.setattr(Shards, "__init__", smaller)
+@in_place_of(Shards, "__init__")
+def two_of_four_are_enough(begin, self, *what, **named):
+    begin(self, *what, **named)
+    self.majority = 2
 
 
-def members_store_entries_of_hosts_that_never_spoke(patch: pytest.MonkeyPatch) -> None:
-    patch.setattr(Witness, "hear_host_state", heard_of_all)
-
-
-def heard_of_all(self: Witness, standing: HostState, now_ns: int) -> None:
+@in_place_of(Witness, "hear_host_state")
+def members_store_entries_of_hosts_that_never_spoke(hear, self, standing, now_ns):
     for name in (standing.agent, "ghost"):
         self._hosts.setdefault(name, _Host(now_ns)).hear(standing, now_ns)
 
 
-def members_hear_of_no_revoked_name(patch: pytest.MonkeyPatch) -> None:
-    patch.setattr(Member, "revoke", lambda self, names, now_ns: None)
+@in_place_of(Member, "revoke")
+def members_hear_of_no_revoked_name(revoke, self, names, now_ns):
+    pass
 
 
-def a_leader_begins_with_its_own_table(patch: pytest.MonkeyPatch) -> None:
-    patch.setattr(shard_member, "agreed", lambda tables: tables[0])
+@in_place_of(shard_member, "agreed")
+def a_leader_begins_with_its_own_table(agreed, tables):
+    return tables[0]
 
 
 @pytest.mark.parametrize(
@@ -153,9 +145,7 @@ def a_leader_begins_with_its_own_table(patch: pytest.MonkeyPatch) -> None:
     ],
     ids=lambda rule: getattr(rule, "__name__", ""),
 )
-def test_each_rule_is_needed(
-    broken: Callable[[pytest.MonkeyPatch], None], first: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_each_rule_is_needed(broken: Broken, first: int, monkeypatch: pytest.MonkeyPatch) -> None:
     broken(monkeypatch)
     assert any(harm_done(seed) for seed in range(first, first + 100))
 

@@ -10,11 +10,10 @@ from planner_service.goal_tree_cache import GoalTrees
 from planner_service.kernels.queue_dial import NO_AIM
 from planner_service.target_tree import TargetTree
 from planner_service.tree.partial_growth import PartialGrowth
-from shared_map.terrain.slope_and_climb import Climb
 from swarm.config.scenario import PlannerConfig
 from swarm.config.setting_types import Strategy
-from swarm.grid import GridSpec, Window, walk
-from swarm.wire.route_columns import RouteStatus
+from swarm.grid import GridSpec, Window
+from swarm.wire.route_columns import RouteBatch, RouteStatus
 
 ROUNDING = 1e-5
 
@@ -80,22 +79,6 @@ def test_a_growth_that_stops_is_exact_where_it_was_and_bounds_the_rest(rules: di
     assert aimed > 20
 
 
-def price(pace: np.ndarray, cells: np.ndarray, rules: dict, climb: Climb | None = None) -> float:
-    """Cost of a route, step by step, each of which the rules must allow."""
-    total = 0.0
-    for here, there in zip(cells[:-1].tolist(), cells[1:].tolist(), strict=True):
-        (r0, c0), (r1, c1) = divmod(here, pace.shape[1]), divmod(there, pace.shape[1])
-        slanted = r0 != r1 and c0 != c1
-        assert max(abs(r0 - r1), abs(c0 - c1)) == 1
-        assert np.isfinite(pace[r1, c1])
-        assert not slanted or rules["neighbours"] == 8
-        assert not slanted or rules["corner_cutting"] or np.isfinite([pace[r0, c1], pace[r1, c0]]).all()
-        length = naive.step_length(1 if slanted else 0, rules["edge"])
-        along = 1.0 if climb is None else climb.along(np.array([here]), np.array([there]))[0]
-        total += float(pace[r1, c1]) * length * along
-    return total
-
-
 @pytest.mark.parametrize("kind", ["narrow", "wide", "directed"])
 def test_lives_of_goals_on_a_map_that_changes_are_answered_as_by_dijkstra(kind: str) -> None:
     rng = np.random.default_rng(2)
@@ -129,9 +112,9 @@ def test_lives_of_goals_on_a_map_that_changes_are_answered_as_by_dijkstra(kind: 
             best = naive.cost_to_go(pace, goal, **rules, climb=climb).flat[start]
             assert route.lower_bound_s <= best * (1 + 1e-12)
             if route.status is RouteStatus.OK:
-                cells = np.array(walk(ground.grid, start, route.directions))
-                assert cells[-1] == goal
-                assert route.cost_s == pytest.approx(price(pace, cells, rules, climb), rel=1e-6)
+                driven = naive.drive(ground.grid, PlannerConfig(**rules), pace, climb, RouteBatch.of([route]))
+                assert driven.last[0] == goal
+                assert route.cost_s == pytest.approx(driven.time_s[0], rel=1e-6)
                 assert route.cost_s == pytest.approx(best, rel=ROUNDING)
                 assert route.lower_bound_s >= best * (1 - 10 * ROUNDING)
             elif route.status is RouteStatus.UNREACHABLE:

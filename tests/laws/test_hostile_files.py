@@ -18,6 +18,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from support.effort import few
+from support.height_models import written
 
 from shared_map.importers.cover.classify import read_labels
 from shared_map.importers.terrain_sources import load_source
@@ -230,18 +231,14 @@ def test_a_raster_that_names_others_reaches_nothing_on_the_network(tmp_path: Pat
 
 
 def _seeds() -> dict[str, bytes]:
-    import rasterio
     from rasterio.io import MemoryFile
+    from rasterio.transform import from_origin
 
     heights = np.arange(64, dtype=np.float32).reshape(8, 8)
     packed = io.BytesIO()
     np.savez_compressed(packed, elevation=heights, resolution_m=10.0)
-    with MemoryFile() as memory:
-        with memory.open(
-            driver="GTiff", height=8, width=8, count=1, dtype="float32", crs="EPSG:32632", compress="deflate",
-            transform=rasterio.transform.from_origin(5e5, 5e6, 10, 10),
-        ) as file:  # fmt: skip
-            file.write(heights, 1)
+    with MemoryFile(ext=".tif") as memory:
+        written(memory.name, heights, compress="deflate", transform=from_origin(5e5, 5e6, 10, 10))
         tiff = bytes(memory.getbuffer())
     return {
         "a.npz": packed.getvalue(),

@@ -11,6 +11,7 @@ import msgspec
 import numpy as np
 import pytest
 from support.map_strategies import GRID, Acknowledged, Composite, held_winners, naive_winners, set_of, sets_asked
+from support.message_fuzzer import mutated
 from support.swarm_model import SwarmModel
 
 from shared_map.keeper.mark_store import KeeperStore
@@ -33,23 +34,6 @@ def examples() -> list[MarkSet]:
         9: (MarkKind.CLEAR, 0.0, 7),
     }
     return [set_of(author, tile, 1, some) for author in ("a1.1", "b2.2") for tile in range(3)]
-
-
-def mutated(payload: bytes, chance: random.Random) -> bytes:
-    """A payload with a few bytes changed, taken out, doubled or cut off."""
-    garbled = bytearray(payload)
-    for _ in range(chance.randint(1, 4)):
-        at = chance.randrange(len(garbled)) if garbled else 0
-        match chance.randrange(5):
-            case 0 | 1 if garbled:
-                garbled[at] ^= 1 << chance.randrange(8)
-            case 2 if garbled:
-                garbled[at] = chance.randrange(256)
-            case 3:
-                garbled[at:at] = bytes(garbled[at : at + chance.randint(1, 9)])
-            case _:
-                del garbled[at : at + chance.randint(1, 9)]
-    return bytes(garbled)
 
 
 def survivors(payloads: list[bytes], kind: type[M], chance: random.Random) -> list[M]:

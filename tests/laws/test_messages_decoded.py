@@ -16,6 +16,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.effort import few
+from support.message_fuzzer import mutated
 from support.wire_strategies import BY_TYPE, EXAMPLES, MESSAGES
 
 from swarm.errors import ProtocolError
@@ -102,28 +103,7 @@ def test_a_hundred_thousand_mutations_raise_nothing_but_protocol_errors():
     accepted = 0
     for n in range(100_000):
         kind = TYPES[n % len(TYPES)]
-        data = bytearray(payloads[kind])
-        for _ in range(rng.choice((1, 1, 1, 2, 4))):
-            at = rng.randrange(len(data) + 1)
-            match rng.randrange(6):
-                case 0:
-                    data[at : at + 1] = bytes([rng.randrange(256)])
-                case 1:
-                    if at < len(data):
-                        data[at] ^= 1 << rng.randrange(8)
-                case 2:
-                    del data[at : at + rng.randrange(1, 9)]
-                case 3:
-                    data[at:at] = rng.randbytes(rng.randrange(1, 9))
-                case 4:
-                    del data[at:]
-                case 5:
-                    other = rng.choice(everything)
-                    start = rng.randrange(len(other))
-                    data[at : at + 4] = other[start : start + rng.randrange(1, 20)]
-            if not data:
-                break
-        accepted += _attempt(bytes(data), kind)
+        accepted += _attempt(mutated(payloads[kind], rng, everything), kind)
     assert 0 < accepted < 50_000
 
 

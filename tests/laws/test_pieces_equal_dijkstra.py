@@ -1,9 +1,7 @@
 """A tree of pieces after any moves, jumps and marks: its costs equal scipy's and the cost of driving along the
 parents."""
 
-import os
-import subprocess
-import sys
+from dataclasses import replace
 from unittest import mock
 
 import numpy as np
@@ -24,6 +22,7 @@ from planner_service.tree.partitioned_tree import PartitionedTree
 from swarm.config.scenario import PlannerConfig
 from swarm.config.setting_types import Strategy
 from swarm.grid import GridSpec, Window
+from swarm.wire.route_columns import OK, RouteBatch
 
 FINE = 1e-11
 """Relative. A step may leave a cost 2**-46 too high, and float64 rounds."""
@@ -133,12 +132,10 @@ class Chase:
         walks = self.ground.walk(self.tree.parent, root, starts[some], 0, self.ground.cell_cost)
         assert (walks.ends >= 0).all(), "a cycle, or a hole"
         np.testing.assert_allclose(walks.driven, cost[given][some], rtol=FINE)
-        end = 0
-        for start, stop in zip(starts[some][:20], walks.ends[:20], strict=True):
-            cell = int(unpadded(self.ground, np.array([start]))[0])
-            steps = walks.directions[end:stop].tobytes()
-            assert naive.follow(self.pace, cell, steps, **self.rules) is not None, "a step that no rule allows"
-            end = stop
+        begun = RouteBatch.none(unpadded(self.ground, starts[some]), OK)
+        routes = replace(begun, directions=walks.directions, ends=walks.ends)
+        driven = naive.drive(self.ground.grid, PlannerConfig(**self.rules), self.pace, None, routes)
+        assert (driven.last == self.tree.root).all(), "a step that no rule allows"
 
 
 def chases(seeds: range, most: int, happenings: int) -> int:
@@ -162,24 +159,6 @@ def test_random_chases() -> None:
 @pytest.mark.thorough
 def test_many_random_chases() -> None:
     assert chases(range(1000, 1300), 260, 12) < 1200
-
-
-@pytest.mark.parametrize(
-    ("how", "count"),
-    [("NUMBA_DISABLE_JIT", 2), pytest.param("NUMBA_BOUNDSCHECK", 40, marks=pytest.mark.thorough)],
-)
-def test_slow_twin(how: str, count: int) -> None:
-    """Uncompiled, and with every index checked, the kernels do the same."""
-    program = f"from laws.test_pieces_equal_dijkstra import chases; chases(range({count}), 40, 3)"
-    paths = os.pathsep.join(path for path in sys.path if path)
-    done = subprocess.run(
-        [sys.executable, "-W", "ignore", "-c", program],
-        env={**os.environ, how: "1", "PYTHONPATH": paths},
-        capture_output=True,
-        text=True,
-        timeout=300,
-    )
-    assert done.returncode == 0, done.stderr
 
 
 @pytest.mark.parametrize(("strategy", "has_worker"), [("exact", False), ("exact", True), ("auto", False)])

@@ -2,7 +2,6 @@
 
 import itertools
 import math
-from fractions import Fraction
 from typing import Literal
 
 import numpy as np
@@ -10,8 +9,8 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from support import segments
 from support.effort import few
-from support.segments import Cell, crossed
 
 from planner_service.any_angle_routes import Puller
 from planner_service.route_finder import RouteFinder
@@ -28,17 +27,6 @@ from vehicle_agent.driving.dynamics import PluginDynamics, Stretch
 from vehicle_agent.driving.motion import Motion
 
 
-def twin_cost_s(pace: NDArray[np.float32], start: Cell, end: Cell, corner_cutting: bool) -> float:
-    shares, corners = crossed(start, end)
-    touched = [cell for cell, _ in shares]
-    if not corner_cutting:
-        touched += [cell for pair in corners for cell in pair]
-    if not all(np.isfinite(pace[cell]) for cell in touched):
-        return math.inf
-    exact = sum(Fraction(float(pace[cell])) * share for cell, share in shares)
-    return float(exact) * math.dist(start, end)
-
-
 @settings(max_examples=few(120), deadline=None)
 @given(
     st.integers(0, 2**32 - 1),
@@ -52,9 +40,7 @@ def test_a_pulled_route_costs_its_integral_is_never_dearer_and_touches_nothing_l
     seed: int, rows: int, cols: int, lethal: float, corner_cutting: bool, neighbours: Literal[4, 8]
 ) -> None:
     random = np.random.default_rng(seed)
-    pace = random.uniform(0.2, 3.0, (rows, cols)).astype(np.float32)
-    pace[random.random((rows, cols)) < lethal] = np.inf
-    pace[0, 0] = 1.0
+    pace = random_ground(random, rows, cols, lethal)
     finder = RouteFinder(pace, (0, 0), resolution_m=2.5, corner_cutting=corner_cutting, neighbours=neighbours)
     for row, col in ((rows - 1, cols - 1), (rows - 1, 0), (rows // 2, cols - 1)):
         route = finder.route(row, col)
@@ -66,7 +52,7 @@ def test_a_pulled_route_costs_its_integral_is_never_dearer_and_touches_nothing_l
         assert pulled.cost_s <= pulled.grid_cost_s
         for cells, cost_s in ((pulled.turns, pulled.cost_s), (route.cells, pulled.grid_cost_s)):
             way = [(int(r), int(c)) for r, c in cells]
-            exact = sum(twin_cost_s(pace, a, b, corner_cutting) for a, b in itertools.pairwise(way))
+            exact = sum(segments.cost_s(pace, a, b, corner_cutting) for a, b in itertools.pairwise(way))
             assert cost_s == pytest.approx(2.5 * exact, rel=1e-12)
 
 
@@ -129,8 +115,8 @@ def test_cells_of_pulled_routes_are_those_that_their_segments_cross(
         assert len(set(cells)) == len(cells)
         assert neighbours == 8 or all(abs(a - c) + abs(b - d) == 1 for (a, b), (c, d) in itertools.pairwise(cells))
         for start, end, along in legs:
-            assert along == [cell for cell, _ in crossed(start, end)[0]]
-            assert math.isfinite(twin_cost_s(pace, start, end, corner_cutting))
+            assert along == [cell for cell, _ in segments.crossed(start, end)[0]]
+            assert math.isfinite(segments.cost_s(pace, start, end, corner_cutting))
         assert route.length_m == pytest.approx(sum(math.dist(a, b) for a, b, _ in legs), rel=1e-12)
     assert encode_again(pulled) == list(pulled)
 

@@ -18,6 +18,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from support import broken_rules as rules
+from support.broken_rules import in_place_of
 from support.effort import few
 from support.shard_tables import AGENTS, MEMBERS, SHARDS, standing, table_of
 from support.traffic_world import TICK_NS, Faults, Process, TrafficWorld, random_faults
@@ -279,145 +280,96 @@ def test_only_those_of_its_layer_answer_a_new_generation(layer: int, asked: int,
 # --- the rules, each taken out ------------------------------------------------------------------------------
 
 
-def usable_without_majority(patch: pytest.MonkeyPatch) -> None:
-    lead = Member._lead
-
-    def hasty(self: Member, leader: Leader, now_ns: int):  # type: ignore[no-untyped-def]
-        return [*lead(self, leader, now_ns), *self._on_file(leader, leader.seq, now_ns)]
-
-    patch.setattr(Member, "_lead", hasty)
+@in_place_of(Member, "_lead")
+def usable_without_majority(lead, self, leader, now_ns):
+    return [*lead(self, leader, now_ns), *self._on_file(leader, leader.seq, now_ns)]
 
 
-def restart_without_file(patch: pytest.MonkeyPatch) -> None:
-    crash = TrafficWorld.crash
-
-    def forgetful(self: TrafficWorld, process: Process) -> None:
-        process.disk.saved.clear()
-        crash(self, process)
-
-    patch.setattr(TrafficWorld, "crash", forgetful)
+@in_place_of(TrafficWorld, "crash")
+def restart_without_file(crash, self, process):
+    process.disk.saved.clear()
+    crash(self, process)
 
 
-def stores_after_a_promise(patch: pytest.MonkeyPatch) -> None:
-    hear = Member.hear_table
-
-    def obliging(self: Member, table, now_ns):  # type: ignore[no-untyped-def]
-        promised, self.promised = self.promised, min(self.promised, table.epoch)
-        actions = hear(self, table, now_ns)
-        self.promised = max(promised, self.promised)
-        return actions
-
-    patch.setattr(Member, "hear_table", obliging)
+@in_place_of(Member, "hear_table")
+def stores_after_a_promise(hear, self, table, now_ns):
+    promised, self.promised = self.promised, min(self.promised, table.epoch)
+    actions = hear(self, table, now_ns)
+    self.promised = max(promised, self.promised)
+    return actions
 
 
-def one_promise_is_enough(patch: pytest.MonkeyPatch) -> None:
-    take = Member._take_charge
-
-    def hasty(self: Member, now_ns: int) -> None:
-        majority, self._shards.majority = self._shards.majority, 1
-        take(self, now_ns)
-        self._shards.majority = majority
-
-    patch.setattr(Member, "_take_charge", hasty)
+@in_place_of(Member, "_take_charge")
+def one_promise_is_enough(take, self, now_ns):
+    majority, self._shards.majority = self._shards.majority, 1
+    take(self, now_ns)
+    self._shards.majority = majority
 
 
-def frees_what_nobody_reported(patch: pytest.MonkeyPatch) -> None:
-    tick = Leader.tick
-
-    def greedy(self: Leader, now_ns: int):  # type: ignore[no-untyped-def]
-        orders = self._orders
-        for host, vehicles in orders.by_host.items():
-            orders.remove(host, {vehicle: orders.of[vehicle][-1:] for vehicle in vehicles}, (1 << 60, 0))
-        return tick(self, now_ns)
-
-    patch.setattr(Leader, "tick", greedy)
+@in_place_of(Leader, "tick")
+def frees_what_nobody_reported(tick, self, now_ns):
+    orders = self._orders
+    for host, vehicles in orders.by_host.items():
+        orders.remove(host, {vehicle: orders.of[vehicle][-1:] for vehicle in vehicles}, (1 << 60, 0))
+    return tick(self, now_ns)
 
 
-def an_older_generation_goes_on(patch: pytest.MonkeyPatch) -> None:
-    hear = Holdings.hear_granted
-
-    def unfenced(self: Holdings, granted, now_ns):  # type: ignore[no-untyped-def]
-        self.generation = self._entries.generation = max(self.generation, granted.generation)
-        return hear(self, granted, now_ns)
-
-    patch.setattr(Holdings, "hear_granted", unfenced)
+@in_place_of(Holdings, "hear_granted")
+def an_older_generation_goes_on(hear, self, granted, now_ns):
+    self.generation = self._entries.generation = max(self.generation, granted.generation)
+    return hear(self, granted, now_ns)
 
 
-def says_that_it_has_left_when_it_sets_out(patch: pytest.MonkeyPatch) -> None:
-    lefts = Holdings.lefts
-
-    def early(self: Holdings, now_ns: int):  # type: ignore[no-untyped-def]
-        entries = self._entries
-        entries._end([path[0] for path in entries.paths.values() if len(path) > 1])
-        return lefts(self, now_ns)
-
-    patch.setattr(Holdings, "lefts", early)
+@in_place_of(Holdings, "lefts")
+def says_that_it_has_left_when_it_sets_out(lefts, self, now_ns):
+    entries = self._entries
+    entries._end([path[0] for path in entries.paths.values() if len(path) > 1])
+    return lefts(self, now_ns)
 
 
-def a_new_generation_takes_what_the_last_one_held(patch: pytest.MonkeyPatch) -> None:
-    patch.setattr(Orders, "_fence", lambda self, host, generation: None)
+@in_place_of(Orders, "_fence")
+def a_new_generation_takes_what_the_last_one_held(fence, self, host, generation):
+    pass
 
 
-def seats_a_file_that_is_not_the_first(patch: pytest.MonkeyPatch) -> None:
-    begin = RightOfWay.begin
-
-    def bold(self: RightOfWay, chance: int):  # type: ignore[no-untyped-def]
-        actions = begin(self, chance)
-        self.own = msgspec.structs.replace(self.own, noted_by=[name for name in self.spawns if name != self.agent])
-        return actions
-
-    patch.setattr(RightOfWay, "begin", bold)
+@in_place_of(RightOfWay, "begin")
+def seats_a_file_that_is_not_the_first(begin, self, chance):
+    actions = begin(self, chance)
+    self.own = msgspec.structs.replace(self.own, noted_by=[name for name in self.spawns if name != self.agent])
+    return actions
 
 
-def acts_on_a_table_that_is_not_the_newest(patch: pytest.MonkeyPatch) -> None:
-    standings = Holdings.standings
-
-    def absent_minded(self: Holdings, wishes, now_ns):  # type: ignore[no-untyped-def]
-        said = standings(self, wishes, now_ns)
-        for known in (self._views, self._entries.knows, self._entries.over):
-            for shard in [shard for shard in known if shard not in self.watched]:
-                del known[shard]
-        return said
-
-    patch.setattr(Holdings, "standings", absent_minded)
+@in_place_of(Holdings, "standings")
+def acts_on_a_table_that_is_not_the_newest(standings, self, wishes, now_ns):
+    said = standings(self, wishes, now_ns)
+    for known in (self._views, self._entries.knows, self._entries.over):
+        for shard in [shard for shard in known if shard not in self.watched]:
+            del known[shard]
+    return said
 
 
-RULES: list[rules.Broken] = [
-    usable_without_majority,
-    restart_without_file,
-    stores_after_a_promise,
-    one_promise_is_enough,
-    frees_what_nobody_reported,
-    an_older_generation_goes_on,
-    rules.forgets_where_an_older_generation_may_stand,
-    rules.follows_without_a_word,
-    rules.follows_on_the_word_of_the_last_before_it,
-    says_that_it_has_left_when_it_sets_out,
-    rules.takes_what_an_older_table_added,
-    rules.believes_that_another_vehicle_of_the_cell_has_left,
-    rules.forgets_who_is_before,
-    a_new_generation_takes_what_the_last_one_held,
-    seats_a_file_that_is_not_the_first,
-    acts_on_a_table_that_is_not_the_newest,
-]
-
-
-FIRST = {
-    "usable_without_majority": 7,
-    "restart_without_file": 86,
-    "stores_after_a_promise": 7,
-    "one_promise_is_enough": 3,
-    "an_older_generation_goes_on": 14,
-    "forgets_where_an_older_generation_may_stand": 14,
-    "follows_on_the_word_of_the_last_before_it": 17,
-    "a_new_generation_takes_what_the_last_one_held": 18,
-    "seats_a_file_that_is_not_the_first": 26,
-    "acts_on_a_table_that_is_not_the_newest": 25,
+RULES: dict[rules.Broken, int] = {
+    usable_without_majority: 7,
+    restart_without_file: 86,
+    stores_after_a_promise: 7,
+    one_promise_is_enough: 3,
+    frees_what_nobody_reported: 0,
+    an_older_generation_goes_on: 14,
+    rules.forgets_where_an_older_generation_may_stand: 14,
+    rules.follows_without_a_word: 0,
+    rules.follows_on_the_word_of_the_last_before_it: 17,
+    says_that_it_has_left_when_it_sets_out: 0,
+    rules.takes_what_an_older_table_added: 0,
+    rules.believes_that_another_vehicle_of_the_cell_has_left: 0,
+    rules.forgets_who_is_before: 0,
+    a_new_generation_takes_what_the_last_one_held: 18,
+    seats_a_file_that_is_not_the_first: 26,
+    acts_on_a_table_that_is_not_the_newest: 25,
 }
-"""Histories tried before the others, because they collided last: rare faults are found soon."""
+"""A rule -> the history that is tried before the others, because it collided last."""
 
 
 @pytest.mark.parametrize("broken", RULES, ids=lambda rule: rule.__name__)
 def test_each_rule_is_needed(broken: rules.Broken, monkeypatch: pytest.MonkeyPatch) -> None:
     broken(monkeypatch)
-    assert rules.collides(FIRST.get(broken.__name__, 0), (world_of, borders_of, world_of, duel_of), QUIET_S)
+    assert rules.collides(RULES[broken], (world_of, borders_of, world_of, duel_of), QUIET_S)

@@ -15,9 +15,8 @@ from swarm.client import Swarm, connect
 def hands(tmp_path: Path) -> Iterator[Hands]:
     hands = Hands(tmp_path)
     yield hands
-    for process in hands.started:
-        process.kill()
-        process.wait(10)
+    for child in hands.started:
+        child.kill()
 
 
 @pytest.fixture(scope="module")

@@ -41,7 +41,7 @@ def test_roles_started_one_by_one_find_the_run_and_serve_routes(hands: Hands) ->
     assert told.stderr.endswith("swarm: agent a1 takes part in run by-hand already; stop it first\n")
     status = json.loads(swarm("status", "--connect", hands.network.connect[0], "--json").stdout)
     assert status["run_id"] == "by-hand"
-    for process in (part, *reversed([p for p in hands.started if p is not part])):
+    for process in (part, *(child.process for child in reversed(hands.started[:-1]))):
         process.send_signal(signal.SIGINT)
         assert process.wait(30) == 0, hands.logs()
 

@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 from support.live_swarm import SWARM, folders_of_runs
-from support.processes import eventually, session_of
+from support.processes import eventually, in_session
 
 from launch_scripts.report.report_and_tracks import TRACKS_FILE, read_tracks
 
@@ -22,7 +22,7 @@ def test_a_short_demo_ends_well_and_its_report_says_so(tmp_path: Path) -> None:
     ) as process:
         out, err = process.communicate(timeout=200)
     assert process.returncode == 0, err
-    eventually(lambda: not session_of(process.pid), 5, "the end of all")
+    eventually(lambda: not in_session(process.pid), 5, "the end of all")
     (run_dir,) = folders_of_runs(tmp_path)
     printed, report = json.loads(out), json.loads((run_dir / "report.json").read_text())
     assert {name: report[name] for name in printed} == printed

@@ -18,7 +18,7 @@ from typing import Any, NamedTuple
 
 import pytest
 from support.installed import ROOT, environment
-from support.processes import eventually
+from support.processes import Child, eventually
 
 from launch_scripts.cli import command
 from launch_scripts.launcher.run_options import scenario_path
@@ -121,18 +121,12 @@ def beside(tmp_path: Path) -> Any:
     bench, demo = Bench(tmp_path, "all"), scenario_path("demo").read_text(encoding="utf-8")
     fewer = demo.replace("vehicles = 99", "vehicles = 9").replace("count = 9", "count = 4")
     (tmp_path / "demo.toml").write_text(fewer, encoding="utf-8")
-    words = ["swarm", "up", "demo.toml", "--port", "0", "--seconds", "600", "--no-live"]
-    swarm = subprocess.Popen(
-        words, cwd=bench.folder, env=bench.around, start_new_session=True, text=True,
-        stdout=subprocess.PIPE, stderr=subprocess.STDOUT, stdin=subprocess.DEVNULL,
-    )  # fmt: skip
-    try:
-        asks = partial(subprocess.run, ["swarm", "status"], cwd=bench.folder, env=bench.around, capture_output=True)
+    words = ("swarm", "up", "demo.toml", "--port", "0", "--seconds", "600", "--no-live")
+    there: dict[str, Any] = {"cwd": bench.folder, "env": bench.around}
+    with Child(tmp_path / "demo.log", *words, **there, start_new_session=True, stdin=subprocess.DEVNULL):
+        asks = partial(subprocess.run, ["swarm", "status"], **there, capture_output=True)
         eventually(lambda: asks().returncode == 0, 60, "the demo")
         yield bench
-    finally:
-        swarm.kill()  # its processes end with it
-        swarm.communicate(timeout=60)
 
 
 def test_each_block_runs_beside_the_demo_which_says_so(beside: Bench) -> None:

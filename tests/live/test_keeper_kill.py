@@ -15,8 +15,9 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from support.far_processes import on_free_port
+from support.made_up_swarm import some_set
 
-from launch_scripts.ports import free_ports
 from shared_map.keeper.mark_store import KeeperStore
 from shared_map.keeper.service import KeeperService
 from shared_map.pace_measurements import ONE, Measurement, columns_of
@@ -31,7 +32,7 @@ from swarm.grid import GridSpec
 from swarm.runtime.inbox import Inbox
 from swarm.runtime.process import Process
 from swarm.runtime.role_setup import RoleSetup
-from swarm.wire.messages.map_data import DIGEST_ROW, SEQ_STEP, Digest, MarkKind
+from swarm.wire.messages.map_data import DIGEST_ROW, SEQ_STEP, Digest
 from swarm.wire.topics import DIGEST, MARKS
 
 SIDE = 256
@@ -41,16 +42,9 @@ GRID = GridSpec(SIDE, SIDE, 10.0)
 LEARNED = beyond_tile(GRID)
 
 
-def keeper_process(endpoint: str, path: str) -> None:
-    network = NetworkConfig(listen=(endpoint,), connect=(endpoint,))
-    setup = RoleSetup(
-        Scenario(network=network, map=MapConfig(digest_s=0.05, learning=True)),
-        "run",
-        "keeper",
-        "k",
-        time.time_ns(),
-        0,
-    )
+def keeper_process(network: NetworkConfig, path: Path) -> None:
+    scenario = Scenario(network=network, map=MapConfig(digest_s=0.05, learning=True))
+    setup = RoleSetup(scenario, "run", "keeper", "k", time.time_ns(), 0)
     terrain = terrain_of_pace(np.ones((SIDE, SIDE), np.float32), GRID.resolution_m)
     with KeeperStore(path) as store, open_bus(network) as bus:
         inbox = Inbox()
@@ -74,16 +68,10 @@ class Load:
                     self.acknowledged[tile] = max(seq, self.acknowledged.get(tile, 0))
 
     def run(self, until_s: float) -> None:
-        cells = np.arange(PER_TILE, dtype=np.uint16)
-        kinds = np.full(PER_TILE, MarkKind.LETHAL, np.uint8)
-        paces = np.zeros(PER_TILE, np.float32)
         while time.monotonic() < until_s:
             for tile in range(TILES):
                 self.put += 1
-                stamps = np.full(PER_TILE, self.put, np.int64)
-                each = mark_set(
-                    "load.1", "all", tile, 1, self.put * SEQ_STEP, Statements(cells, kinds, paces, stamps)
-                )
+                each = some_set(tile, self.put * SEQ_STEP, PER_TILE, author="load.1")
                 self._bus.publish(MARKS, each, region=0, tile=tile, author="load.1")
             self._learn()
             time.sleep(0.002)
@@ -99,8 +87,7 @@ class Load:
 def kill_rounds(rounds: int, folder: Path, seed: int = 1) -> dict[str, int]:
     """Kills a keeper so often; returns how much was put, acknowledged and lost."""
     chance = random.Random(seed)
-    endpoint = f"tcp/127.0.0.1:{free_ports(1)[0]}"
-    network = NetworkConfig(listen=(endpoint,), connect=(endpoint,))
+    network = on_free_port()
     spawning = multiprocessing.get_context("forkserver")
     spawning.set_forkserver_preload([__name__ if __name__ != "__main__" else "test_keeper_kill"])
     path = folder / "map.sqlite"
@@ -109,7 +96,7 @@ def kill_rounds(rounds: int, folder: Path, seed: int = 1) -> dict[str, int]:
         load = Load(bus)
         for _ in range(rounds):
             before = dict(load.acknowledged)
-            child = spawning.Process(target=keeper_process, args=(endpoint, str(path)))
+            child = spawning.Process(target=keeper_process, args=(network, path))
             child.start()
             deadline = time.monotonic() + 30
             while load.acknowledged == before:
@@ -123,9 +110,7 @@ def kill_rounds(rounds: int, folder: Path, seed: int = 1) -> dict[str, int]:
             time.sleep(0.05)  # for digests under way: what they acknowledge counts as well
             acknowledged = dict(load.acknowledged)
             with KeeperStore(path) as store:
-                on_disk = {}
-                for each in store.load():
-                    on_disk[each.tile] = each.seq
+                on_disk = {each.tile: each.seq for each in store.load()}
             found["acknowledgements"] += sum(acknowledged[t] != before.get(t) for t in acknowledged)
             found["words_acknowledged"] += acknowledged.get(LEARNED) != before.get(LEARNED)
             found["lost"] += sum(on_disk.get(tile, -1) < seq for tile, seq in acknowledged.items())

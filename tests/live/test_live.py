@@ -13,7 +13,7 @@ from pathlib import Path
 import psutil
 import pytest
 from support.live_swarm import SWARM, LiveSwarm, ask, client, swarm
-from support.processes import eventually, session_of
+from support.processes import eventually, in_session
 
 from launch_scripts.simulation.replay import replay_run
 from swarm.bus.zenoh_bus import ZenohBus
@@ -239,7 +239,7 @@ def test_a_ctrl_c_ends_all_in_order_and_leaves_the_report(live: LiveSwarm) -> No
     assert report["payloads_dropped"] > 0
     for name in ("report.png", "run.rrd", "router-0.log", "planner-t1.log", "launcher.log"):
         assert (live.run_dir / name).stat().st_size > 0
-    eventually(lambda: not session_of(live.process.pid), 5, "the end of all")
+    eventually(lambda: not in_session(live.process.pid), 5, "the end of all")
 
 
 def test_each_process_of_it_gives_the_same_when_its_inputs_are_replayed(live: LiveSwarm) -> None:

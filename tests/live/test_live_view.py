@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from support.devtools import CHROMIUM, Browser, BrowserError
 from support.fake_run import fake_run
 from support.monitor_rig import LIVE, Rig, hidden_truth, little_scenario, little_terrain
+from support.processes import eventually
 
 from launch_scripts.monitor.live_layout import BACKGROUND
 from launch_scripts.ports import free_ports
@@ -60,18 +61,16 @@ def complete(picture: bytes) -> bool:
     return counts["background"] > 10_000 and counts["ground"] > 30_000 and counts["t0"] > 20 and counts["t1"] > 20
 
 
-def until_complete(screenshot: Callable[[], bytes], folder: Path, within_s: float) -> bytes:
-    deadline_s = time.monotonic() + within_s
-    while True:
-        picture = b""
+def wait_until_complete(screenshot: Callable[[], bytes], folder: Path, within_s: float) -> None:
+    last = folder / "last.png"
+
+    def shown() -> bool:
         with contextlib.suppress(BrowserError, TimeoutError):
-            picture = screenshot()
-        if picture and complete(picture):
-            return picture
-        if time.monotonic() > deadline_s:
-            (folder / "last.png").write_bytes(picture)
-            pytest.fail(f"after {within_s:g} s the view is not complete; see {folder / 'last.png'}")
-        time.sleep(1.0)
+            last.write_bytes(screenshot())
+            return complete(last.read_bytes())
+        return False
+
+    eventually(shown, within_s, f"the complete view, of which {last} is the last picture,", every_s=1.0)
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="needs chromium: apt-get install chromium")
@@ -80,7 +79,7 @@ def test_a_browser_shows_ground_targets_and_vehicles_and_asks_nobody_else(shown:
     browser = Browser(tmp_path / "profile", SIZE)
     try:
         browser.open(shown.sinks.page.server.url)
-        until_complete(browser.screenshot, tmp_path, within_s=200)
+        wait_until_complete(browser.screenshot, tmp_path, within_s=200)
         hosts = {urllib.parse.urlparse(url).hostname for url in browser.reached if url.startswith("http")}
         assert hosts == {"127.0.0.1"}
         elsewhere = [url for url in browser.requested if url.startswith("http") and "//127.0.0.1" not in url]
@@ -107,7 +106,7 @@ def test_the_native_viewer_shows_the_same(shown: Rig, tmp_path: Path) -> None:
             client.save_screenshot(str(tmp_path / "view.png"))
             return (tmp_path / "view.png").read_bytes()
 
-        until_complete(screenshot, tmp_path, within_s=100)
+        wait_until_complete(screenshot, tmp_path, within_s=100)
     finally:
         viewer.kill()
         viewer.wait()

@@ -5,7 +5,6 @@ from __future__ import annotations
 import os
 import re
 import signal
-import subprocess
 import sys
 from collections.abc import Iterator
 from pathlib import Path
@@ -15,7 +14,7 @@ import pytest
 from rasterio.transform import from_origin
 from support.height_models import written
 from support.live_swarm import SWARM, LiveSwarm, running
-from support.processes import eventually
+from support.processes import Child, eventually
 
 from launch_scripts.ports import free_ports
 from swarm.client import Swarm, connect
@@ -45,27 +44,6 @@ caught = "stay"
 [[groups]]
 vehicles = 1
 """
-
-
-class Child:
-    """A process under way, whose output is read from a file."""
-
-    def __init__(self, output: Path, *command: object) -> None:
-        self.output = output
-        with output.open("w") as file:
-            self.process = subprocess.Popen(
-                list(map(str, command)), stdout=file, stderr=subprocess.STDOUT, env={**os.environ}
-            )
-
-    def said(self, pattern: str) -> re.Match[str] | None:
-        return re.search(pattern, self.output.read_text(), re.MULTILINE)
-
-    def waits_for(self, pattern: str, within_s: float = 60.0) -> None:
-        eventually(lambda: self.said(pattern), within_s, f"{pattern!r} in {self.output.name}")
-
-    def kill(self) -> None:
-        self.process.kill()
-        self.process.wait(10)
 
 
 @pytest.fixture(scope="module")
@@ -106,7 +84,7 @@ def pair(tmp_path: Path, live: LiveSwarm, swarm: Swarm) -> Iterator[Pair]:
     yield pair
     for child in pair.children:
         child.kill()
-        sys.stdout.write(f"--- {child.output.name}\n{child.output.read_text()[-4000:]}\n")  # shown of a failure
+        sys.stdout.write(f"--- {child.output.name}\n{child.text[-4000:]}\n")  # shown of a failure
 
 
 def test_a_vehicle_of_mavlink_alone_is_avoided_and_gone_when_its_adapter_dies(pair: Pair, swarm: Swarm) -> None:
@@ -116,8 +94,8 @@ def test_a_vehicle_of_mavlink_alone_is_avoided_and_gone_when_its_adapter_dies(pa
         eventually(lambda: "rover" in watching.vehicles, 60, "the rover in the swarm")
         seen = watching.vehicles["rover"]
         assert swarm.frame.cell(seen.x_m, seen.y_m) == swarm.frame.grid.cell(*START)
-        assert adapter.said("found an autopilot without modes")
-        assert not adapter.said("mission"), "nothing is driven without --target"
+        assert "found an autopilot without modes" in adapter.text
+        assert "mission" not in adapter.text, "nothing is driven without --target"
         adapter.process.send_signal(signal.SIGKILL)
         eventually(lambda: "rover" not in watching.vehicles, 5, "the end of the lease")
 
@@ -125,40 +103,40 @@ def test_a_vehicle_of_mavlink_alone_is_avoided_and_gone_when_its_adapter_dies(pa
 def test_without_arm_a_mission_is_uploaded_and_the_vehicle_stays_where_it_is(pair: Pair, swarm: Swarm) -> None:
     vehicle = pair.vehicle()
     pair.adapter("--target", "t")
-    vehicle.waits_for(r"^mission \d+ ")
-    found = vehicle.said(r"^mission (\d+) (\S+) (\S+)")
+    vehicle.wait_for(r"^mission \d+ ")
+    found = re.search(r"^mission (\d+) (\S+) (\S+)", vehicle.text, re.MULTILINE)
     end = swarm.frame.cell(*swarm.frame.from_wgs84(float(found[2]), float(found[3])))
     row, col = swarm.frame.grid.row_col(end)
     assert max(abs(row - TARGET[0]), abs(col - TARGET[1])) <= 1, "its last item is the target's cell"
     assert int(found[1]) < 40, "turns, not cells"
-    vehicle.waits_for(r"(?s)mission.*^at .*^at .*^at ")
-    assert not vehicle.said("armed")
-    assert len(set(re.findall(r"^at (.*)$", vehicle.output.read_text(), re.MULTILINE))) == 1
+    vehicle.wait_for(r"(?s)mission.*^at .*^at .*^at ")
+    assert "armed" not in vehicle.text
+    assert len(set(re.findall(r"^at (.*)$", vehicle.text, re.MULTILINE))) == 1
 
 
 def test_with_arm_it_drives_to_the_target_and_goes_on_after_either_side_died(pair: Pair, swarm: Swarm) -> None:
     with swarm.observer() as watching:
         first = pair.vehicle()
         adapter = pair.adapter("--target", "t", "--arm", "--id", "rover")
-        first.waits_for("^armed 1")
+        first.wait_for("^armed 1")
         x_m = swarm.frame.centre_m(swarm.frame.grid.cell(*START))[0]
         eventually(lambda: watching.vehicles["rover"].x_m > x_m + 100, 60, "its driving")
         first.kill()
-        adapter.waits_for("no heartbeat for 2 s: the vehicle is left to its own fail-safe")
+        adapter.wait_for("no heartbeat for 2 s: the vehicle is left to its own fail-safe")
         second = pair.vehicle()
-        second.waits_for(r"^mission \d+ ")
-        adapter.waits_for("left alone from now on: it was disarmed, and not by us")
-        assert not second.said("armed")
+        second.wait_for(r"^mission \d+ ")
+        adapter.wait_for("left alone from now on: it was disarmed, and not by us")
+        assert "armed" not in second.text
         adapter.kill()
         pair.adapter("--target", "t", "--arm", "--id", "rover")
-        second.waits_for("^armed 1")
+        second.wait_for("^armed 1")
         eventually(lambda: watching.vehicles["rover"].x_m > x_m + 100, 60, "its driving again")
 
 
 def test_when_the_router_dies_the_vehicle_is_back_with_the_next_one(pair: Pair, live: LiveSwarm) -> None:
     pair.vehicle()
     adapter = pair.adapter("--target", "t", "--id", "rover")
-    adapter.waits_for("the vehicle is in the swarm")
+    adapter.wait_for("the vehicle is in the swarm")
     first = live.pid_of("router-0")
     os.kill(first, signal.SIGKILL)
     eventually(lambda: live.pid_of("router-0") != first, 60, "another router")

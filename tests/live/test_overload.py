@@ -7,12 +7,11 @@ import time
 
 import pytest
 from support.dummy_roles import Idle
+from support.far_processes import on_free_port
 
-from launch_scripts.ports import free_ports
 from swarm.bus.bus import Asked, AskEnded, Event, Replied, Undecoded
 from swarm.bus.zenoh_bus import ZenohBus, open_bus
 from swarm.clock import MonotonicClock
-from swarm.config.scenario import NetworkConfig
 from swarm.runtime.inbox import Inbox
 from swarm.runtime.process import Process
 from swarm.wire.messages.planning import CostReply, CostRequest
@@ -59,8 +58,7 @@ class Slow(Idle):
 
 
 def test_under_twice_the_load_nine_of_ten_answers_go_to_those_who_still_wait():
-    endpoint = f"tcp/127.0.0.1:{free_ports(1)[0]}"
-    network = NetworkConfig(listen=(endpoint,), connect=(endpoint,))
+    network = on_free_port()
     inbox = Inbox()
     replies: list[Replied] = []
     ends: list[AskEnded] = []

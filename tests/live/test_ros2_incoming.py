@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-import subprocess
 import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import pytest
-from support.live_swarm import SWARM, LiveSwarm
+from support.live_swarm import LiveSwarm
 from support.processes import eventually
-from support.ros_peer import RosPeer, ros_router, write_definitions
+from support.ros_peer import Gateway, RosPeer, ros_router, write_definitions
 
 from launch_scripts.gateways.ros2.ros_messages import RosMap
 from launch_scripts.gateways.ros2.ros_types import types_of
+from launch_scripts.ports import free_ports
 from swarm.client import Observer, Swarm, connect
 
 pytestmark = [pytest.mark.network, pytest.mark.slow]
@@ -68,21 +68,12 @@ def seen(swarm: Swarm) -> Iterator[Observer]:
 def port(live: LiveSwarm, tmp_path_factory: pytest.TempPathFactory) -> Iterator[int]:
     """Port of the ROS side's router, with a gateway at work."""
     folder = tmp_path_factory.mktemp("gateway")
-    (folder / "gateway.toml").write_text(SETTINGS)
-    with ros_router() as port, (folder / "log").open("w") as log:
-        process = subprocess.Popen(
-            [*SWARM, "gateway", "ros2", str(folder / "gateway.toml"), "--connect", live.endpoint,
-             "--ros", f"tcp/127.0.0.1:{port}", "--runs", str(live.runs)],
-            stdout=log, stderr=log,
-        )  # fmt: skip
-        try:
-            said = folder / "log"
-            eventually(lambda: "run " in said.read_text() or process.poll() is not None, 60, "the gateway")
-            assert process.poll() is None, said.read_text()
-            yield port
-        finally:
-            process.kill()
-            process.wait(10)
+    settings = folder / "gateway.toml"
+    settings.write_text(SETTINGS)
+    port = free_ports(1)[0]
+    words = (settings, "--runs", live.runs)
+    with ros_router(port), Gateway(live.endpoint, f"tcp/127.0.0.1:{port}", folder, *words):
+        yield port
 
 
 @pytest.fixture

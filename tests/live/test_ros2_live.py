@@ -7,23 +7,21 @@ import sys
 import time
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
-from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
 import zenoh
-from support.far_processes import Far
+from support.far_processes import NAMESPACE, Far, on_free_port
 from support.live_swarm import SWARM, LiveSwarm
 from support.made_up_swarm import swarm_peer
 from support.processes import eventually
 from support.ros_node import PeerNode
-from support.ros_peer import RosPeer, ros_router, write_definitions
+from support.ros_peer import Gateway, RosPeer, ros_router, write_definitions
 
 from launch_scripts.gateways.ros2.gateway_settings import ROWS
 from launch_scripts.gateways.ros2.rmw import Qos
 from launch_scripts.gateways.ros2.ros_node import open_ros
 from launch_scripts.gateways.ros2.ros_types import types_of
-from launch_scripts.ports import free_ports
 from swarm.bus.zenoh_bus import open_bus
 from swarm.config.scenario import NetworkConfig
 
@@ -34,57 +32,23 @@ TYPES = types_of("jazzy")
 OUT = list(ROWS)
 
 
-@dataclass
-class Gateway:
-    """A gateway at a router of the ROS side, and the swarm behind it.
-
-    swarm  endpoint of its router
-    """
-
-    swarm: str
-    port: int
-    folder: Path
-    runs: Path
-
-    @property
-    def endpoint(self) -> str:
-        return f"tcp/127.0.0.1:{self.port}"
-
-    def start(self, *options: str) -> subprocess.Popen[str]:
-        with (self.folder / "ros2.log").open("w") as log:
-            return subprocess.Popen(
-                [*SWARM, "gateway", "ros2", "--connect", self.swarm, "--ros", self.endpoint,
-                 "--runs", str(self.runs), *options],
-                stdout=log, stderr=log, text=True,
-            )  # fmt: skip
-
-    @property
-    def said(self) -> str:
-        return (self.folder / "ros2.log").read_text()
-
-
 @pytest.fixture(scope="module")
-def gateway(live: LiveSwarm, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Gateway]:
+def port() -> Iterator[int]:
+    """Port of the ROS side's router."""
     with ros_router() as port:
-        yield Gateway(live.endpoint, port, tmp_path_factory.mktemp("ros"), live.runs)
+        yield port
 
 
 @pytest.fixture
-def running(gateway: Gateway) -> Iterator[Gateway]:
-    process = gateway.start()
-    try:
-        eventually(lambda: "run " in gateway.said or process.poll() is not None, 30, "the gateway's first word")
-        assert process.poll() is None, gateway.said
+def gateway(live: LiveSwarm, port: int, tmp_path: Path) -> Iterator[Gateway]:
+    with Gateway(live.endpoint, f"tcp/127.0.0.1:{port}", tmp_path, "--runs", live.runs) as gateway:
         yield gateway
-    finally:
-        process.kill()
-        process.wait(10)
 
 
 @pytest.fixture
-def session(gateway: Gateway) -> Iterator[zenoh.Session]:
+def session(port: int) -> Iterator[zenoh.Session]:
     """Session of a node of ours at the ROS side's router."""
-    with open_ros(gateway.endpoint) as session:
+    with open_ros(f"tcp/127.0.0.1:{port}") as session:
         yield session
 
 
@@ -97,14 +61,14 @@ def topic_of(row: str) -> str:
     return ROWS[row].topic.format(vehicle="a0_01", target="t0")
 
 
-def test_a_foreign_stack_lists_every_topic(running: Gateway) -> None:
+def test_a_foreign_stack_lists_every_topic(gateway: Gateway, port: int) -> None:
     program = "from zenoh_ros2_sdk.cli import main; main()"
     # This terrain has no coordinates.
     expected = {f"{topic_of(row)} [{ROWS[row].type_name}]" for row in OUT if row != "fix"}
 
     def missing() -> set[str]:
         listed = subprocess.run(
-            [sys.executable, "-c", program, "--no-daemon", "--router", f"127.0.0.1:{running.port}",
+            [sys.executable, "-c", program, "--no-daemon", "--router", f"127.0.0.1:{port}",
              "topic", "list", "-t"],
             capture_output=True, text=True, timeout=30, check=False,
         )  # fmt: skip
@@ -113,7 +77,7 @@ def test_a_foreign_stack_lists_every_topic(running: Gateway) -> None:
     eventually(lambda: not missing(), 60, "every topic in the list")  # each is there once it has something to tell
 
 
-def test_a_latched_map_comes_to_who_comes_late(running: Gateway, session: zenoh.Session) -> None:
+def test_a_latched_map_comes_to_who_comes_late(gateway: Gateway, session: zenoh.Session) -> None:
     node = PeerNode(session, "late", TYPES)
     maps, frames = [], []
     time.sleep(1.5)  # the map was put long before
@@ -129,14 +93,14 @@ def test_a_latched_map_comes_to_who_comes_late(running: Gateway, session: zenoh.
     node.close()
 
 
-def test_a_peer_of_another_domain_or_distribution_is_logged(running: Gateway, session: zenoh.Session) -> None:
+def test_a_peer_of_another_domain_or_distribution_is_logged(gateway: Gateway, session: zenoh.Session) -> None:
     elsewhere = PeerNode(session, "far", TYPES, domain=7)
     elsewhere.subscribe("/map", ROWS["map"].type_name, lambda message: None)
-    eventually(lambda: "node far subscribes to /map in domain 7" in running.said, 15, "the word about a domain")
+    eventually(lambda: "node far subscribes to /map in domain 7" in gateway.text, 15, "the word about a domain")
     elsewhere.close()
     older = PeerNode(session, "old", types_of("humble"))
     older.subscribe("/map", ROWS["map"].type_name, lambda message: None)
-    eventually(lambda: "node old subscribes to /map as humble does" in running.said, 15, "the word about humble")
+    eventually(lambda: "node old subscribes to /map as humble does" in gateway.text, 15, "the word about humble")
     older.close()
 
 
@@ -144,24 +108,18 @@ def test_after_kill_9_of_the_gateway_nothing_of_it_is_left(gateway: Gateway, ses
     there: set[str] = set()
     node = PeerNode(session, "watcher", TYPES)
     node.watch("0", lambda seen, is_there: there.add(seen.topic) if is_there else there.discard(seen.topic))
-    process = gateway.start()
-    try:
-        eventually(lambda: {topic_of(row) for row in OUT if row != "fix"} <= there, 40, "all topics")
-    finally:
-        process.kill()
-        process.wait(10)
+    eventually(lambda: {topic_of(row) for row in OUT if row != "fix"} <= there, 40, "all topics")
+    gateway.kill()
     eventually(lambda: not there, 15, "the end of all tokens")
     node.close()
 
 
-def test_the_gateway_ends_at_ctrl_c_and_says_what_it_lacks(gateway: Gateway) -> None:
-    process = gateway.start()
-    eventually(lambda: "run " in gateway.said, 60, "the gateway's first word")
-    process.send_signal(2)
-    assert process.wait(40) == 0, gateway.said
-    assert "Traceback" not in gateway.said
+def test_the_gateway_ends_at_ctrl_c_and_says_what_it_lacks(gateway: Gateway, live: LiveSwarm) -> None:
+    gateway.process.send_signal(2)
+    assert gateway.process.wait(40) == 0, gateway.text
+    assert "Traceback" not in gateway.text
     alone = subprocess.run(
-        [*SWARM, "gateway", "ros2", "--connect", gateway.swarm, "--ros", "tcp/127.0.0.1:9"],
+        [*SWARM, "gateway", "ros2", "--connect", live.endpoint, "--ros", "tcp/127.0.0.1:9"],
         capture_output=True, text=True, timeout=60, check=False,
     )  # fmt: skip
     assert alone.returncode == 4
@@ -186,9 +144,13 @@ def made_up_swarm(network: NetworkConfig, run_id: str) -> Iterator[None]:
         yield
 
 
+def gateway_of(network: NetworkConfig, port: int, folder: Path) -> Gateway:
+    words = ("--namespace", network.namespace, "--runs", folder)
+    return Gateway(network.connect[0], f"tcp/127.0.0.1:{port}", folder, *words)
+
+
 def test_a_foreign_stack_hears_every_type(tmp_path: Path, definitions: Path) -> None:
-    endpoint = f"tcp/127.0.0.1:{free_ports(1)[0]}"
-    network = NetworkConfig(namespace="bench", listen=(endpoint,), connect=(endpoint,))
+    network = on_free_port(NAMESPACE)
     with ExitStack() as ends:
         ends.enter_context(made_up_swarm(network, "bench"))
         port = ends.enter_context(ros_router())
@@ -196,9 +158,7 @@ def test_a_foreign_stack_hears_every_type(tmp_path: Path, definitions: Path) -> 
         # Before the gateway starts: the SDK does not ask for latched messages.
         for row in OUT:
             peer.hear(topic_of(row), ROWS[row].type_name)
-        process = Gateway(endpoint, port, tmp_path, tmp_path).start("--namespace", "bench")
-        ends.callback(process.wait, 10)
-        ends.callback(process.kill)
+        ends.enter_context(gateway_of(network, port, tmp_path))
         eventually(lambda: all(peer.heard[topic_of(row)] for row in OUT), 40, "a message of each topic")
         pose = peer.heard[topic_of("pose")][-1]
         assert pose["header"]["frame_id"] == "map"
@@ -212,22 +172,18 @@ def test_a_foreign_stack_hears_every_type(tmp_path: Path, definitions: Path) -> 
 
 
 def test_either_side_may_go_and_come_back_and_the_next_run_is_told_as_well(tmp_path: Path) -> None:
-    endpoint = f"tcp/127.0.0.1:{free_ports(1)[0]}"
-    network = NetworkConfig(namespace="bench", listen=(endpoint,), connect=(endpoint,))
+    network = on_free_port(NAMESPACE)
     with ExitStack() as ends:
         with made_up_swarm(network, "first"):
             with ros_router() as port:
-                gateway = Gateway(endpoint, port, tmp_path, tmp_path)
-                process = gateway.start("--namespace", "bench")
-                ends.callback(process.wait, 10)
-                ends.callback(process.kill)
+                gateway = ends.enter_context(gateway_of(network, port, tmp_path))
                 poses_heard(port, 40)
-            eventually(lambda: "the ROS router" in gateway.said, 15, "the word about the router that is gone")
+            eventually(lambda: "the ROS router" in gateway.text, 15, "the word about the router that is gone")
             with ros_router(port):
                 poses_heard(port, 20)
         ends.enter_context(ros_router(port))
         ends.enter_context(made_up_swarm(network, "second"))
-        eventually(lambda: "run second" in gateway.said, 40, "the next run")
+        eventually(lambda: "run second" in gateway.text, 40, "the next run")
         poses_heard(port, 20)
-        assert process.poll() is None, gateway.said
-        assert "Traceback" not in gateway.said
+        assert gateway.process.poll() is None, gateway.text
+        assert "Traceback" not in gateway.text

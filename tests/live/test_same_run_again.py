@@ -10,8 +10,8 @@ from pathlib import Path
 
 import msgspec
 import pytest
-from support.live_swarm import LiveSwarm, swarm
-from support.processes import eventually, session_of
+from support.live_swarm import running, swarm
+from support.processes import eventually, in_session
 
 from launch_scripts.launcher.run_options import find_scenario
 
@@ -30,24 +30,17 @@ def sets_in(store: Path) -> int:
 def test_a_launcher_that_is_killed_and_started_again_with_its_run_id_goes_on_with_the_keepers_store(
     tmp_path: Path, kill: Callable[[int, int], None]
 ) -> None:
-    first = LiveSwarm(tmp_path, "--run-id", "again", "--no-live")
-    try:
-        first.wait_until_up()
+    words = ("--run-id", "again", "--no-live")
+    with running(tmp_path, *words) as first:
         store = tmp_path / "runs" / "again" / "map.sqlite"
         eventually(lambda: store.exists() and sets_in(store) > 0, 60, "marks in the store")
         os.kill(first.pid_of("planner-t0"), signal.SIGSTOP)  # which notices nothing
         kill(first.process.pid, signal.SIGKILL)  # with it or after it all that it started ends
         first.process.wait(10)
-        eventually(lambda: not session_of(first.process.pid), 10, "the end of all")
+        eventually(lambda: not in_session(first.process.pid), 10, "the end of all")
         before = sets_in(store)
-    finally:
-        first.kill()
-    second = LiveSwarm(tmp_path, "--run-id", "again", "--no-live")
-    try:
-        second.wait_until_up()
+    with running(tmp_path, *words):
         assert sets_in(store) >= before
-    finally:
-        second.end()
 
 
 def test_parts_of_a_swarm_that_are_started_on_several_machines_belong_to_one_run_whoever_comes_first() -> None:

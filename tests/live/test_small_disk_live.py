@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pytest
 from support.live_swarm import SWARM, folders_of_runs, write_scenario
-from support.processes import eventually
+from support.processes import Child
 
 pytestmark = [pytest.mark.network, pytest.mark.slow]
 
@@ -33,10 +33,6 @@ def lines_of(path: Path) -> list[str]:
     return [" ".join(line.split()) for line in path.read_text().splitlines()]
 
 
-def until(path: Path, words: str, within_s: float) -> None:
-    eventually(lambda: words in path.read_text(), within_s, f"{words!r} in {path}")
-
-
 def fill(path: Path) -> None:
     with path.open("wb", buffering=0) as file:
         while True:
@@ -44,17 +40,14 @@ def fill(path: Path) -> None:
 
 
 def test_a_full_disk_stops_nobody_and_all_goes_on_when_there_is_space(tmp_path: Path, disk: Path) -> None:
-    out = tmp_path / "out.txt"
-    command = [*SWARM, "up", str(write_scenario(tmp_path)), "--runs", str(disk / "runs"), "--plain"]
-    with out.open("w") as file:
-        swarm = subprocess.Popen(command, stdout=file, stderr=subprocess.STDOUT)
-    try:
-        until(out, "routes are served", 240)
+    out, words = tmp_path / "out.txt", ("--runs", disk / "runs", "--plain")
+    with Child(out, *SWARM, "up", write_scenario(tmp_path), *words, start_new_session=True) as swarm:
+        swarm.wait_for("routes are served", 240)
         (run_dir,) = folders_of_runs(disk / "runs")
         filler = disk / "filler"
         with pytest.raises(OSError, match="No space"):
             fill(filler)
-        until(out, f"cannot write {run_dir}: No space left on device", 20)
+        swarm.wait_for(f"cannot write {run_dir}: No space left on device", 20)
         for role in ("agent", "keeper"):  # one that dies meanwhile lives again on the full disk
             name = next(path.stem for path in run_dir.glob(f"{role}*.log"))
             pid = next(
@@ -63,18 +56,14 @@ def test_a_full_disk_stops_nobody_and_all_goes_on_when_there_is_space(tmp_path: 
             subprocess.run(["kill", "-9", pid], check=True)
         time.sleep(4)
         filler.unlink()
-        until(out, f"{run_dir} can be written again", 20)
-        until(out, "the recording had ended, and goes on in", 30)
-        swarm.send_signal(signal.SIGINT)
-        assert swarm.wait(timeout=60) == 0, out.read_text()
-    finally:
-        if swarm.poll() is None:
-            swarm.terminate()
-            swarm.wait(timeout=20)
+        swarm.wait_for(f"{run_dir} can be written again", 20)
+        swarm.wait_for("the recording had ended, and goes on in", 30)
+        swarm.process.send_signal(signal.SIGINT)
+        assert swarm.process.wait(timeout=60) == 0, swarm.text
     said = lines_of(out)
     assert any(line.startswith("12 of 12 vehicles routed, ") and "no collisions." in line for line in said)
     assert "restarts 2" in said
-    assert "Traceback" not in out.read_text()
+    assert "Traceback" not in swarm.text
     assert all("Traceback" not in path.read_text() for path in run_dir.glob("*.log*"))
     assert (run_dir / "report.json").is_file()
     assert (run_dir / "report.png").is_file()

@@ -2,19 +2,16 @@
 
 from __future__ import annotations
 
-import contextlib
 import itertools
 import os
 import signal
-import subprocess
 import sys
 import time
-from collections.abc import Iterator
 from pathlib import Path
 
 import pytest
 from support.live_swarm import SWARM, LiveSwarm, client
-from support.processes import eventually, session_of
+from support.processes import Child, eventually
 
 from swarm.bus.bus import Event, Heard, Replied
 from swarm.bus.endpoints import listening
@@ -79,20 +76,10 @@ class Leaders:
         return {"first": self.told.get("t0"), "second": self.told.get("t0.r1")} == told
 
 
-@contextlib.contextmanager
-def machine(live: LiveSwarm, folder: Path) -> Iterator[subprocess.Popen[bytes]]:
+def machine(live: LiveSwarm, folder: Path) -> Child:
     """A launcher elsewhere, with the planners that lead, in a session of its own."""
-    options = ["--connect", live.endpoint, "--only", "planner", "--rank", "0", "--plain", "--runs", str(folder)]
-    with (folder / "output.txt").open("w") as output:
-        launcher = subprocess.Popen(
-            [*SWARM, "up", str(live.path), *options], stdout=output, stderr=output, start_new_session=True
-        )
-    try:
-        yield launcher
-    finally:
-        if session_of(launcher.pid):
-            os.killpg(launcher.pid, signal.SIGKILL)
-        launcher.wait(10)
+    options = ("--connect", live.endpoint, "--only", "planner", "--rank", "0", "--plain", "--runs", folder)
+    return Child(folder / "output.txt", *SWARM, "up", live.path, *options, start_new_session=True)
 
 
 @pytest.mark.thorough
@@ -100,14 +87,14 @@ def test_vehicles_and_clients_are_answered_again_soon_after_the_planners_machine
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
     parts = [option for role in ("router", "keeper", "targets", "planner", "agent") for option in ("--only", role)]
-    live = LiveSwarm(tmp_path, *parts, "--rank", "1", also="\n[standbys]\nplanner = 1\ntargets = 1\n")
+    also = "\n[standbys]\nplanner = 1\ntargets = 1\n"
     elsewhere = tmp_path / "elsewhere"
     elsewhere.mkdir()
     gaps_s: dict[str, float] = {}
-    try:
+    with LiveSwarm(tmp_path, *parts, "--rank", "1", also=also) as live:
         eventually(lambda: listening(live.endpoint), 60, "the router")
-        with client(live.network) as bus, machine(live, elsewhere) as launcher:
-            leaders = Leaders(bus)
+        with client(live.network) as bus, machine(live, elsewhere) as far:
+            launcher, leaders = far.process, Leaders(bus)
             eventually(lambda: leaders.are(first=True, second=False), 150, "the planner of rank 0 to lead")
             for how, number in (("hangs", signal.SIGSTOP), ("is dead", signal.SIGKILL)):
                 asker = Asker(bus, "t0")
@@ -117,13 +104,11 @@ def test_vehicles_and_clients_are_answered_again_soon_after_the_planners_machine
                 asker.ask_for(SECONDS_PER_CASE)
                 gaps_s[how] = asker.longest_gap_s()
                 assert asker.answers[-1][1] not in before, how
-                assert gaps_s[how] < LONGEST_GAP_S, (how, live.output.read_text())
+                assert gaps_s[how] < LONGEST_GAP_S, (how, gaps_s, live.text)
                 if number == signal.SIGSTOP:
                     os.killpg(launcher.pid, signal.SIGCONT)
                     eventually(lambda: leaders.are(first=True, second=False), 60, "rank 0 to lead again")
             assert leaders.lost == 0
-    finally:
-        live.kill()
-        told = ", ".join(f"{gap_s:.2f} s when the machine {how}" for how, gap_s in gaps_s.items())
-        with capsys.disabled():
-            sys.stdout.write(f"\nlongest time without an answer: {told}\n")
+    told = ", ".join(f"{gap_s:.2f} s when the machine {how}" for how, gap_s in gaps_s.items())
+    with capsys.disabled():
+        sys.stdout.write(f"\nlongest time without an answer: {told}\n")

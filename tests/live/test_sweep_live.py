@@ -10,8 +10,7 @@ from pathlib import Path
 
 import psutil
 import pytest
-from support.process_usage import in_session
-from support.processes import eventually
+from support.processes import eventually, in_session
 from support.small_study import STUDY, dies_of_seed_one, write_study
 
 from launch_scripts.simulation import study_sweep

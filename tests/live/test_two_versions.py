@@ -11,14 +11,14 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 import pytest
 from support.live_swarm import SWARM, client, write_scenario
 from support.neighbour import ROOT, environment_of, neighbour_tree
-from support.processes import eventually
+from support.processes import Child, eventually
 
 from launch_scripts.stop_requests import SAME_S
 from swarm.bus.bus import Event, Heard
@@ -64,12 +64,12 @@ class Machine:
         self.folder.mkdir()
         self._scenario = scenario
         self._endpoint = load_scenario(scenario).network.connect[0]
-        self.started: list[subprocess.Popen[bytes]] = []
+        self.started: list[Child] = []
 
     @property
     def process(self) -> subprocess.Popen[bytes]:
         """The launcher that was started last."""
-        return self.started[-1]
+        return self.started[-1].process
 
     def start(self, tree: Path, *more: str) -> None:
         """Starts its part of the swarm with the version in `tree`."""
@@ -78,13 +78,9 @@ class Machine:
             options += ["--connect", self._endpoint]
         if self._part.rank is not None:
             options += ["--rank", str(self._part.rank)]
-        command = [*SWARM, "up", str(self._scenario), *options, "--runs", str(self.folder / "runs"), "--plain"]
-        with (self.folder / "output.txt").open("ab") as output:
-            self.started.append(
-                subprocess.Popen(
-                    [*command, *more], stdout=output, stderr=output, cwd=tree, env=environment_of(tree)
-                )
-            )
+        words = ("up", self._scenario, *options, "--runs", self.folder / "runs", "--plain", *more)
+        output = self.folder / f"output-{len(self.started)}.txt"
+        self.started.append(Child(output, *SWARM, *words, cwd=tree, env=environment_of(tree)))
 
     def stop(self) -> int:
         """Ends it in order. Returns its exit code."""
@@ -93,7 +89,7 @@ class Machine:
 
     def said(self) -> str:
         """All output of its launchers."""
-        return (self.folder / "output.txt").read_text()
+        return "\n".join(child.text for child in self.started)
 
     @property
     def lives(self) -> bool:
@@ -103,22 +99,19 @@ class Machine:
 
     def up(self) -> bool:
         """True if the launcher that was started last reports that all is up."""
-        return self.lives and self.said().count("all processes are alive") >= len(self.started)
+        return self.lives and "all processes are alive" in self.started[-1].text
 
     def ask_to_end(self) -> None:
         """For the end of a test: asked twice, it writes no report."""
-        for process in self.started:
-            if process.poll() is None:
-                process.send_signal(signal.SIGINT)
+        for child in self.started:
+            child.process.send_signal(signal.SIGINT)
 
     def end(self) -> None:
         """Waits for the end of the stopped processes, and kills those which do not end."""
-        for process in self.started:
-            try:
-                process.wait(20)
-            except subprocess.TimeoutExpired:
-                process.kill()
-                process.wait(10)
+        for child in self.started:
+            with suppress(subprocess.TimeoutExpired):
+                child.process.wait(20)
+            child.kill()
 
 
 class Routed:

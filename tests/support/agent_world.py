@@ -10,23 +10,21 @@ import numpy as np
 from msgspec.structs import replace
 from numpy.typing import NDArray
 from support.makers import cost_reply, route_reply, target_pose
-from support.slow_twins import cost_to_go, way_down
 from support.swarm_model import SwarmModel
 
+from planner_service.target_tree import TargetTree
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.bus.bus import Asked, Event, Heard
 from swarm.bus.memory_bus import LinkModel
 from swarm.clock import NS_PER_S
-from swarm.config.scenario import AgentPlan, plan_agents
+from swarm.config.scenario import AgentPlan, PlannerConfig, plan_agents
 from swarm.config.toml_files import parse_scenario
-from swarm.grid import walk
 from swarm.peers import Peer
 from swarm.right_of_way.promise_store import PromiseStore
 from swarm.wire.fields import column
 from swarm.wire.messages.map_data import MarkKind, MarkSet
 from swarm.wire.messages.planning import CostReply, CostRequest, RouteReply, RouteRequest, TargetPose
 from swarm.wire.messages.vehicles import Fleet, Followed, VehicleState
-from swarm.wire.route_columns import Route, RouteBatch, RouteStatus
 from swarm.wire.topics import COST, FLEET, FOLLOWED, MARKS, POSE, ROUTE
 from vehicle_agent.driving.driven_vehicle import Vehicle
 from vehicle_agent.service import AgentService
@@ -58,14 +56,14 @@ OPEN = ["." * 20] * 20
 """A picture for `pace_of`: level ground without an obstacle."""
 
 
-def pace_of(picture: Sequence[str], pace: float = 0.1) -> NDArray[np.float32]:
+def pace_of(picture: Sequence[str]) -> NDArray[np.float32]:
     """Pace from a picture: '#' is lethal, '~' is three times as slow, anything else is level ground."""
-    values = {"#": math.inf, "~": 3 * pace}
-    return np.array([[values.get(sign, pace) for sign in line] for line in picture], np.float32)
+    values = {"#": math.inf, "~": 0.3}
+    return np.array([[values.get(sign, 0.1) for sign in line] for line in picture], np.float32)
 
 
 class FakePlanner:
-    """Serves exact routes and costs to one target from a tree that is grown again for every question."""
+    """Serves exact routes and costs to one target, from one tree and without any cores around it."""
 
     def __init__(self, world: AgentWorld, target: str, incarnation: int = 1) -> None:
         self.world = world
@@ -75,7 +73,7 @@ class FakePlanner:
         self.requests: list[RouteRequest] = []
         self.mute = False
         self.incarnation = incarnation
-        self._cost: NDArray[np.float64] | None = None
+        self._tree = TargetTree(world.terrain.grid, PlannerConfig(strategy="full"))
         self.bus = world.bus(f"planner-{target}-{incarnation}")
         self.bus.subscribe(POSE, self.handle, target=target)
         self.bus.subscribe(MARKS, self.handle)
@@ -86,9 +84,8 @@ class FakePlanner:
     def handle(self, event: Event) -> None:
         match event:
             case Heard(message=TargetPose() as pose):
-                if pose.cell != self.cell:
-                    self._cost = None
                 self.cell = pose.cell
+                self._tree.update(self.pace, self.cell, [], 0)
             case Heard(message=MarkSet() as marks):
                 self._mark(marks)
             case Asked(request=RouteRequest() as request):
@@ -112,42 +109,15 @@ class FakePlanner:
             row, col = window.row0 + int(inner) // 32, window.col0 + int(inner) % 32
             value = {MarkKind.PACE: float(pace), MarkKind.LETHAL: math.inf}.get(MarkKind(kind), prior[row, col])
             self.pace[row, col] = value
-        self._cost = None
-
-    def cost(self) -> NDArray[np.float64] | None:
-        """Cost-to-go of every cell, for cells of one metre; None before the first pose."""
-        if self._cost is None and self.cell is not None:
-            self._cost = cost_to_go(self.pace, self.cell)
-        return self._cost
-
-    def route(self, start: int, max_cells: int = 0) -> Route:
-        cost = self.cost()
-        if cost is None:
-            return Route(status=RouteStatus.NO_TARGET, start=start)
-        if not math.isfinite(cost.flat[start]):
-            return Route(status=RouteStatus.UNREACHABLE, start=start)
-        grid = self.world.terrain.grid
-        directions = way_down(self.pace, cost, start, max_cells)
-        cost_s, remaining_s = (
-            float(cost.flat[cell]) * grid.resolution_m for cell in (start, walk(grid, start, directions)[-1])
-        )
-        return Route(
-            status=RouteStatus.OK,
-            start=start,
-            directions=directions,
-            cost_s=cost_s,
-            lower_bound_s=cost_s,
-            remaining_s=remaining_s,
-        )
+        if self.cell is not None:
+            self._tree.update(self.pace, self.cell, [window], 0)
 
     def _routes(self, request: RouteRequest) -> RouteReply:
-        routes = RouteBatch.of([self.route(cell, request.max_cells) for cell in request.cells])
+        routes = self._tree.routes(request.cells, request.max_cells)
         return route_reply(routes, self.world.terrain.grid, **self._fields)
 
     def _costs(self, request: CostRequest) -> CostReply:
-        cost, metres = self.cost(), self.world.terrain.grid.resolution_m
-        costs = [math.inf if cost is None else cost.flat[cell] * metres for cell in request.cells]
-        return cost_reply(costs, **self._fields)
+        return cost_reply(self._tree.cost_to_go_at(np.array(request.cells)).tolist(), **self._fields)
 
     @property
     def _fields(self) -> dict[str, Any]:
@@ -163,9 +133,8 @@ class AgentWorld(SwarmModel):
         prior: NDArray[np.float32],
         truth: NDArray[np.float32] | None = None,
         links: LinkModel | None = None,
-        resolution_m: float = 10.0,
     ) -> None:
-        super().__init__(links, terrain_of_pace(prior, resolution_m), parse_scenario(scenario))
+        super().__init__(links, terrain_of_pace(prior, 10.0), parse_scenario(scenario))
         self.truth = np.array(self.terrain.ground_s_per_m if truth is None else truth, np.float32)
         self.agents: dict[str, AgentService] = {}
         self.stores: dict[str, PromiseStore] = {}

@@ -5,24 +5,16 @@ from __future__ import annotations
 import json
 import subprocess
 import sys
-from typing import IO, Any
+from typing import Any
 
 from bench import harness
 from typer.testing import CliRunner, Result
 
-BENCH = [sys.executable, "-m", "bench"]
-
 
 def command(*words: object, timeout_s: float = 60.0) -> subprocess.CompletedProcess[str]:
     """Runs `./launch_scripts/bench` to its end, in a process of its own."""
-    called = [*BENCH, *map(str, words)]
+    called = [sys.executable, "-m", "bench", *map(str, words)]
     return subprocess.run(called, capture_output=True, text=True, timeout=timeout_s, check=False)
-
-
-def begin(*words: object, said: IO[str], **options: Any) -> subprocess.Popen[bytes]:
-    """Starts it, and returns at once; `said` gets what it prints."""
-    called = [*BENCH, *map(str, words)]
-    return subprocess.Popen(called, stdout=said, stderr=said, **options)
 
 
 def run(*words: str) -> Result:

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, Protocol
 
+from support.makers import target_pose
+
 from swarm.bus.bus import Asked, AskEnded, Bus, Event, Replied
 from swarm.wire.messages import Nothing
 from swarm.wire.messages.map_data import MarkSet
@@ -40,7 +42,7 @@ class Box(list[Any]):
 
 
 def pose(target: str = "t0", seq: int = 1) -> TargetPose:
-    return TargetPose(target=target, incarnation=1, seq=seq, stamp_ns=5, cell=3, x_m=1.0, y_m=2.0)
+    return target_pose(target, 3, seq=seq, stamp_ns=5, x_m=1.0, y_m=2.0)
 
 
 def note(text: str, id: str = "a0") -> Note:

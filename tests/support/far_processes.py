@@ -28,7 +28,7 @@ class Far:
 
     def __init__(self, network: NetworkConfig | None = None) -> None:
         self._starts_router = network is None
-        self.network = network or _on_free_port()
+        self.network = network or on_free_port(NAMESPACE)
         self._spawning = multiprocessing.get_context("spawn")
         self._running: list[tuple[BaseProcess, Connection]] = []
 
@@ -67,17 +67,21 @@ class Far:
             process.join(_END_S)
 
 
-def _on_free_port() -> NetworkConfig:
-    [port] = free_ports(1)
-    endpoint = f"tcp/127.0.0.1:{port}"
-    return NetworkConfig(namespace=NAMESPACE, listen=(endpoint,), connect=(endpoint,))
+def on_free_port(namespace: str = "swarm") -> NetworkConfig:
+    endpoint = f"tcp/127.0.0.1:{free_ports(1)[0]}"
+    return NetworkConfig(namespace=namespace, listen=(endpoint,), connect=(endpoint,))
 
 
 def asked(far: Connection, *question: Any, within_s: float = 60.0) -> Any:
     """Asks a process over its pipe and returns its answer."""
     far.send(question)
+    return answered(far, question[0], within_s)
+
+
+def answered(far: Connection, what: object, within_s: float) -> Any:
+    """The answer to the question that was sent last."""
     if not far.poll(within_s):
-        raise SwarmError(f"no answer to {question[0]} within {within_s:.0f} s")
+        raise SwarmError(f"no answer to {what} within {within_s:.0f} s")
     return far.recv()
 
 

@@ -32,7 +32,8 @@ def unpadded(cost_grid: CostGrid, padded: np.ndarray) -> np.ndarray:
 
 def loaded(pace: np.ndarray, grid: GridSpec | None = None, climb: Climb | None = None, **config: Any) -> CostGrid:
     """The costs of a map of paces, on cells of a metre where no grid is given, under the rules of the planner."""
-    costs = CostGrid(grid or GridSpec(*pace.shape, 1.0), PlannerConfig(**config), climb)
+    rows, cols = pace.shape
+    costs = CostGrid(grid or GridSpec(rows, cols, 1.0), PlannerConfig(**config), climb)
     costs.load(pace)
     return costs
 

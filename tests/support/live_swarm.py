@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import msgspec
-from support.processes import eventually, session_of
+from support.processes import Child, eventually
 
 from launch_scripts.ports import free_ports
 from swarm.bus.bus import AskEnded, Replied
@@ -85,19 +85,15 @@ def swarm(*arguments: object, timeout_s: float = 120.0) -> subprocess.CompletedP
     return subprocess.run(command, capture_output=True, text=True, timeout=timeout_s, check=False)
 
 
-class LiveSwarm:
+class LiveSwarm(Child):
     """`swarm up` under way, in a session of its own."""
 
     def __init__(self, folder: Path, *options: object, also: str = "", text: str = _SCENARIO) -> None:
         self.path = write_scenario(folder, also, text)
         self.scenario: Scenario = load_scenario(self.path)
-        self.output = folder / "output.txt"
         self.runs = folder / "runs"
-        command = [*SWARM, "up", self.path, "--runs", self.runs, "--plain", *options]
-        with self.output.open("w") as output:
-            self.process = subprocess.Popen(
-                list(map(str, command)), stdout=output, stderr=subprocess.STDOUT, start_new_session=True
-            )
+        words = ("up", self.path, "--runs", self.runs, "--plain", *options)
+        super().__init__(folder / "output.txt", *SWARM, *words, start_new_session=True)
 
     @property
     def network(self) -> NetworkConfig:
@@ -113,8 +109,8 @@ class LiveSwarm:
         return run_dir
 
     def said(self, text: str) -> bool:
-        assert self.process.poll() is None, self.output.read_text()
-        return text in self.output.read_text()
+        assert self.process.poll() is None, self.text
+        return text in self.text
 
     def wait_until_up(self) -> None:
         eventually(lambda: self.said("all processes are alive"), 90, "the start of the swarm")
@@ -129,22 +125,13 @@ class LiveSwarm:
         os.killpg(self.process.pid, signal.SIGINT)
         return self.process.wait(60)
 
-    def kill(self) -> None:
-        """For the end of a test that failed."""
-        if session_of(self.process.pid):
-            os.killpg(self.process.pid, signal.SIGKILL)
-        self.process.wait(10)
-
 
 @contextlib.contextmanager
 def running(folder: Path, *options: object, also: str = "", text: str = _SCENARIO) -> Iterator[LiveSwarm]:
     """A swarm all of whose processes are alive, and which is killed in the end."""
-    live = LiveSwarm(folder, *options, also=also, text=text)
-    try:
+    with LiveSwarm(folder, *options, also=also, text=text) as live:
         live.wait_until_up()
         yield live
-    finally:
-        live.kill()
 
 
 class Hands:
@@ -154,19 +141,13 @@ class Hands:
         self.folder = folder
         self.path = write_scenario(folder)
         self.network = load_scenario(self.path).network
-        self.started: list[subprocess.Popen[str]] = []
+        self.started: list[Child] = []
 
-    def start(self, *arguments: str, runs: Path | None = None) -> subprocess.Popen[str]:
+    def start(self, *arguments: str, runs: Path | None = None) -> subprocess.Popen[bytes]:
         name = "-".join(arguments[:3]).replace("/", "_")
-        with (self.folder / f"{name}.log").open("w") as log:
-            process = subprocess.Popen(
-                [*SWARM, *arguments, "--runs", str(runs or self.folder / "runs")],
-                stdout=log,
-                stderr=log,
-                text=True,
-            )
-        self.started.append(process)
-        return process
+        words = (*arguments, "--runs", runs or self.folder / "runs")
+        self.started.append(Child(self.folder / f"{name}.log", *SWARM, *words))
+        return self.started[-1].process
 
     def members(self) -> list[tuple[str, str, str]]:
         with client(self.network) as bus:

@@ -9,6 +9,7 @@ from typing import Any
 import msgspec
 import numpy as np
 from numpy.typing import NDArray
+from support.makers import fleet_of, run_info, target_pose
 
 from shared_map.replication.marks import Statements, mark_set
 from swarm.bus.bus import Asked
@@ -19,18 +20,15 @@ from swarm.runtime.inbox import Inbox
 from swarm.wire.fields import pack_column
 from swarm.wire.messages import WIRE_VERSION
 from swarm.wire.messages.map_data import MarkKind, MarkSet
-from swarm.wire.messages.planning import TargetPose
-from swarm.wire.messages.processes import RunInfo
-from swarm.wire.messages.vehicles import NO_TARGET, Fleet, Followed, VehicleState
+from swarm.wire.messages.vehicles import Fleet, Followed
 from swarm.wire.topics import FLEET, FOLLOWED, MARKS, POSE, RUN
 
-GRID = GridSpec(2048, 2048, 10.0)
+GRID = GridSpec(2048, 2048, 10.0, 500_000.0, 5_300_000.0, "EPSG:32632")
 Numbers = NDArray[Any]
 _PER_AGENT = 25
 _HZ = 10.0
 _ROUTE_CELLS, _NEW_ROUTE_S = 200, 2.0
 _MARK_SETS_A_TICK, _MARKS = 1, 20
-_WEST_M, _NORTH_M, _CRS = 500_000.0, 5_300_000.0, "EPSG:32632"
 
 
 def some_set(tile: int, seq: int, marks: int, author: str = "far.1") -> MarkSet:
@@ -42,16 +40,14 @@ def some_set(tile: int, seq: int, marks: int, author: str = "far.1") -> MarkSet:
 
 
 def some_fleet(
-    agent: str, region: int, seq: int, cells: Numbers, east_m: Numbers, south_m: Numbers, target_ids: list[str]
+    agent: str, region: int, seq: int, cells: Numbers, east_m: Numbers, south_m: Numbers, target: str
 ) -> Fleet:
-    """An agent's vehicles, all of which drive east, after the first target if there is one."""
-    many = len(cells)
-    return Fleet(
-        author=f"{agent}.1", group="all", region=region, seq=seq, stamp_ns=time.time_ns(), target_ids=target_ids,
-        ids=[f"{agent}-{n:02d}" for n in range(many)], cells=pack_column(cells, "<u4"),
-        east_m=pack_column(east_m, "<f4"), south_m=pack_column(south_m, "<f4"),
-        heading_rad=pack_column(np.full(many, np.pi / 2), "<f4"), states=bytes([VehicleState.FOLLOWING] * many),
-        targets=bytes([0 if target_ids else NO_TARGET] * many),
+    """An agent's vehicles, all of which drive east, after a target."""
+    east = pack_column(np.full(len(cells), np.pi / 2), "<f4")
+    return fleet_of(
+        [f"{agent}-{n:02d}" for n in range(len(cells))], cells=list(cells), east_m=list(east_m),
+        south_m=list(south_m), target=target, author=f"{agent}.1", region=region, seq=seq,
+        stamp_ns=time.time_ns(), heading_rad=east,
     )  # fmt: skip
 
 
@@ -61,10 +57,9 @@ def swarm_peer(
     """Agents whose vehicles drive east at 10 m/s, get a new route every two seconds and mark the map, and a target,
     for this time. Answers which run it is."""
     inbox, now_ns = Inbox(), time.time_ns()
-    info = RunInfo(
-        run_id=run_id, role="keeper", id="0", incarnation=now_ns, scenario="bench", terrain="none", rows=GRID.rows,
-        cols=GRID.cols, resolution_m=GRID.resolution_m, started_ns=now_ns, west_m=_WEST_M, north_m=_NORTH_M,
-        crs=_CRS, wire_version=WIRE_VERSION,
+    info = run_info(
+        GRID, run_id=run_id, role="keeper", id="0", incarnation=now_ns, scenario="bench", terrain="none",
+        started_ns=now_ns, wire_version=WIRE_VERSION,
     )  # fmt: skip
     with open_bus(network) as bus:
         bus.serve(RUN, inbox.post, role="keeper", id="0")
@@ -74,10 +69,7 @@ def swarm_peer(
         while time.monotonic() < began_s + seconds and not pipe.poll():
             tick += 1
             _tell(bus, tick, vehicles)
-            target = TargetPose(
-                target="t0", incarnation=now_ns, seq=tick, stamp_ns=time.time_ns(), cell=0,
-                x_m=_WEST_M + 5.0, y_m=_NORTH_M - 5.0,
-            )  # fmt: skip
+            target = target_pose("t0", 0, GRID, incarnation=now_ns, seq=tick, stamp_ns=time.time_ns())
             bus.publish(POSE, target, target="t0")
             while (event := inbox.take(max(0.0, began_s + tick / _HZ - time.monotonic()))) is not None:
                 if isinstance(event, Asked):
@@ -93,7 +85,7 @@ def _tell(bus: ZenohBus, tick: int, vehicles: int) -> None:
         south_m = np.full(_PER_AGENT, 500.0 + 100.0 * agent)
         cells = (south_m // GRID.resolution_m).astype(int) * GRID.cols + (east_m // GRID.resolution_m).astype(int)
         ids = [f"a{agent}-{n:02d}" for n in numbers]
-        fleet = some_fleet(f"a{agent}", agent, tick, cells, east_m, south_m, ["t0"])
+        fleet = some_fleet(f"a{agent}", agent, tick, cells, east_m, south_m, "t0")
         bus.publish(FLEET, fleet, region=agent, author=author)
         for n in range(tick % int(_NEW_ROUTE_S * _HZ), _PER_AGENT, int(_NEW_ROUTE_S * _HZ)):
             steps = bytes((np.arange(_ROUTE_CELLS) // 7 % 2 + 2).astype(np.uint8))  # east and south-east

@@ -94,7 +94,7 @@ def planner_status(target: str = "t0", **told: Any) -> PlannerStatus:
 
     told  fields that differ from the defaults here
     """
-    fields = {
+    fields: dict[str, Any] = {
         "incarnation": 1, "stamp_ns": 1, "strategy": "exact", "target_cell": 5, "map_version": 1,
         "tree_age_ms": 1.0,
         "window": [], "growths": 3, "window_growths": 2, "growth_ms": 1.5, "routes_served": 9, "following": 1,

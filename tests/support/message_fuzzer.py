@@ -365,3 +365,28 @@ def _limits(metas: list[msgspec.Meta]) -> tuple[Any, Any]:
     if most is None:
         most = next((meta.lt - 1 for meta in metas if meta.lt is not None), 1e300)
     return least, most
+
+
+def mutated(payload: bytes, chance: random.Random, others: Sequence[bytes] = ()) -> bytes:
+    """A payload with a few bytes changed, put in, taken out, doubled or cut off, or spliced in from others."""
+    data = bytearray(payload)
+    for _ in range(chance.choice((1, 1, 1, 2, 4))):
+        at, many = chance.randrange(len(data) + 1), chance.randint(1, 9)
+        match chance.randrange(7):
+            case 0:
+                data[at : at + 1] = chance.randbytes(1)
+            case 1:
+                data[at : at + 1] = bytes(byte ^ 1 << chance.randrange(8) for byte in data[at : at + 1])
+            case 2:
+                del data[at : at + many]
+            case 3:
+                data[at:at] = chance.randbytes(many)
+            case 4:
+                data[at:at] = data[at : at + many]
+            case 5:
+                del data[at:]
+            case 6 if others:
+                other = chance.choice(others)
+                start = chance.randrange(len(other))
+                data[at : at + 4] = other[start : start + chance.randrange(1, 20)]
+    return bytes(data)

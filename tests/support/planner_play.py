@@ -29,7 +29,10 @@ _MARKED = np.array([np.inf, 0.5, 1.0, 20.0, 500.0, PACE_LEAST, PACE_MOST], np.fl
 class Play:
     """A tree, its map, and the job that a worker may have of it.
 
+    grid        of the map; cells of a metre by default
+    target      where the target begins; by default on the first passable cell
     has_worker  long growths are left to that job: until it is adopted, answers are about where the target was
+    in_pieces   the tree lies in pieces, as if the map were large
     """
 
     def __init__(
@@ -41,14 +44,19 @@ class Play:
         has_worker: bool = False,
         chosen_by: Strategy | None = None,
         climb: Climb | None = None,
+        grid: GridSpec | None = None,
+        target: int | None = None,
+        in_pieces: bool = False,
     ) -> None:
         self.pace = pace
         self.config = config
-        self.grid = GridSpec(*pace.shape, 1.0)
+        rows, cols = pace.shape
+        self.grid = grid or GridSpec(rows, cols, 1.0)
         self.tree = TargetTree(self.grid, config, climb, all_kernels, has_worker=has_worker, chosen_by=chosen_by)
+        self.tree.times.in_pieces |= in_pieces
         self.has_worker = has_worker
         self.version = 0
-        self.target = int(np.flatnonzero(np.isfinite(pace))[0])
+        self.target = int(np.flatnonzero(np.isfinite(pace))[0]) if target is None else target
         self.grown: GrownTree | None = None
         self.search: Callable[[], StrideNetwork] | None = None
         self.since: list[Window] = []
@@ -92,7 +100,7 @@ class Play:
     def walk(self, rng: np.random.Generator, steps: int, check_every: int) -> set[str]:
         """Moves to random neighbours, with marks and a worker's growths now and then. Returns the kind of
         growth."""
-        kinds = set()
+        kinds: set[str] = set()
         for step in range(steps):
             self.happen(Move(int(rng.integers(-1, 2)), int(rng.integers(-1, 2))))
             kinds.add(self.last.kind)
@@ -161,8 +169,7 @@ class Play:
         last, seconds = naive.drive(self.grid, self.config, self.pace, self.rules["climb"], routes)
         assert (last[cells] == target).all(), "a route enters a lethal cell, squeezes or leaves the grid"
         driven = seconds[cells]
-        cost = np.array([routes[cell].cost_s for cell in cells])
-        bound = np.array([routes[cell].lower_bound_s for cell in cells])
+        cost, bound = routes.cost_s[cells], routes.lower_bound_s[cells]
         upper = self.tree.cost_to_go_at(cells)
         best = optimum[cells]
         np.testing.assert_allclose(cost, driven, rtol=1e-6)

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from support.makers import target_pose
 from support.scripted_planner import chasers
 from support.slow_twins import cost_to_go
 from support.swarm_model import SwarmModel
@@ -25,7 +26,7 @@ from swarm.config.setting_types import Strategy
 from swarm.grid import GridSpec, walk
 from swarm.wire.messages import Message
 from swarm.wire.messages.map_data import MarkKind
-from swarm.wire.messages.planning import RouteReply, RouteRequest, TargetPose
+from swarm.wire.messages.planning import RouteReply, RouteRequest
 from swarm.wire.messages.processes import Stats
 from swarm.wire.route_columns import Route
 from swarm.wire.topics import CHASERS, POSE, PUSHED_ROUTE, ROUTE, STATS, STATUS, Topic
@@ -90,16 +91,16 @@ class Ear:
         self.world.run(0.01)
         return self.replies
 
-    def routes(self, *cells: int, target: str = "t", **fields: Any) -> RouteReply:
-        (reply,) = self.ask(ROUTE, RouteRequest(cells=list(cells), **fields), target=target)
+    def routes(self, *cells: int, **fields: Any) -> RouteReply:
+        (reply,) = self.ask(ROUTE, RouteRequest(cells=list(cells), **fields), target="t")
         assert isinstance(reply, RouteReply)
         return reply
 
     def of(self, kind: type[Any]) -> list[Any]:
         return [message for message in self.heard if isinstance(message, kind)]
 
-    def last_stats(self, role: str = "planner") -> Stats:
-        return [stats for stats in self.of(Stats) if stats.role == role][-1]  # type: ignore[no-any-return]
+    def last_stats(self) -> Stats:
+        return [stats for stats in self.of(Stats) if stats.role == "planner"][-1]  # type: ignore[no-any-return]
 
 
 def planning(world: SwarmModel, role: str, id: str, incarnation: int = 1) -> Callable[[MemoryBus, Post], Planning]:
@@ -140,13 +141,12 @@ class Swarm(SwarmModel):
         """Ten poses a second of every target that has been put somewhere."""
         self._seq += 1
         for id, cell in self.cells.items():
-            pose = TargetPose(target=id, incarnation=1, seq=self._seq, stamp_ns=0, cell=cell, x_m=0, y_m=0)
-            self.ear.bus.publish(POSE, pose, target=id)
+            self.ear.bus.publish(POSE, target_pose(id, cell, seq=self._seq), target=id)
         self.scheduler.after(TICK, self._track)
 
     def mark(self, *cells: int, kind: MarkKind = MarkKind.LETHAL, pace: float = 0.0) -> None:
         self.author.sync.publish(self.author.replica.write(list(cells), kind, pace, self.now_ns))
 
-    def report(self, *vehicles: tuple[str, int], target: str = "t") -> None:
-        told = chasers(*vehicles, target=target, stamp_ns=self.now_ns)
-        self.ear.bus.publish(CHASERS, told, target=target, author=told.author)
+    def report(self, *vehicles: tuple[str, int]) -> None:
+        told = chasers(*vehicles, target="t", stamp_ns=self.now_ns)
+        self.ear.bus.publish(CHASERS, told, target="t", author=told.author)

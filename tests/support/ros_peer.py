@@ -1,7 +1,9 @@
-"""A foreign ROS 2 peer in a process of its own: zenoh-ros2-sdk, with definitions written from our types."""
+"""`swarm gateway ros2` as a process, a router of the ROS side, and a foreign peer in a process of its own, which is
+zenoh-ros2-sdk with definitions written from our types."""
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import queue
@@ -11,21 +13,41 @@ import tempfile
 import threading
 import time
 from collections.abc import Iterator
-from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
 import zenoh
+from support.live_swarm import SWARM
+from support.processes import Child, eventually
 
 from launch_scripts.gateways.ros2.ros_types import REQUEST, RESPONSE, RosTypes
 from launch_scripts.ports import free_ports
+from swarm.errors import SwarmError
 
+_START_S = 60.0
 _PROGRAM = Path(__file__).with_name("ros_peer_program.py")
 _LONGEST_S = 120.0
 _EMPTY = "uint8 structure_needs_at_least_one_member"
 
 
-@contextmanager
+class Gateway(Child):
+    """`swarm gateway ros2` between the routers at two endpoints, as users start it. Use it in a `with`, which waits
+    until it is in a run, and kills it in the end. Raises SwarmError, with what it said, if it does not start."""
+
+    def __init__(self, swarm: str, ros: str, folder: Path, *words: object) -> None:
+        where = ("--connect", swarm, "--ros", ros)
+        super().__init__(folder / "ros2.log", *SWARM, "gateway", "ros2", *words, *where)
+
+    def __enter__(self) -> Self:
+        with contextlib.suppress(AssertionError):
+            eventually(lambda: "run " in self.text or self.process.poll() is not None, _START_S)
+        if "run " not in self.text or self.process.poll() is not None:
+            self.kill()
+            raise SwarmError(f"the gateway does not start: {self.text.strip()}")
+        return self
+
+
+@contextlib.contextmanager
 def ros_router(port: int | None = None) -> Iterator[int]:
     """The port of a router in this process, of the kind that rmw_zenohd is: it does not forward between peers."""
     port = port or free_ports(1)[0]

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+from support.makers import target_pose
 
 from planner_service.growth_times import GrowthTimes
 from planner_service.planner import Action, Planner, Work
@@ -191,15 +192,13 @@ class World:
 
 
 def pose(cell: int, seq: int = 1, incarnation: int = 1, target: str = "t0") -> TargetPose:
-    return TargetPose(
-        target=target, tracker="radar", incarnation=incarnation, seq=seq, stamp_ns=0, cell=cell, x_m=0, y_m=0
-    )
+    return target_pose(target, cell, tracker="radar", seq=seq, incarnation=incarnation)
 
 
-def chasers(*vehicles: tuple[str, int], stamp_ns: int, target: str = "t0", author: str = "all.a0.1") -> Chasers:
+def chasers(*vehicles: tuple[str, int], stamp_ns: int, target: str = "t0") -> Chasers:
     return Chasers(
         target=target,
-        author=author,
+        author="all.a0.1",
         stamp_ns=stamp_ns,
         ids=[id for id, _ in vehicles],
         cells=pack_column([cell for _, cell in vehicles], "<u4"),

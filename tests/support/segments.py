@@ -1,10 +1,13 @@
-"""Straight segments between centres of cells, with crossings that are fractions."""
+"""Straight segments between centres of cells, with crossings that are fractions: what they touch and cost."""
 
 from __future__ import annotations
 
 import itertools
 import math
 from fractions import Fraction
+
+import numpy as np
+from numpy.typing import NDArray
 
 Cell = tuple[int, int]
 
@@ -31,3 +34,15 @@ def crossed(start: Cell, end: Cell) -> tuple[list[tuple[Cell, Fraction]], list[t
         )
         corners.append(((before[0], after[1]), (after[0], before[1])))
     return shares, corners
+
+
+def cost_s(pace: NDArray[np.float32], start: Cell, end: Cell, corner_cutting: bool = False) -> float:
+    """The integral of the pace along a segment, where a cell is a metre; inf where it may not be driven."""
+    shares, corners = crossed(start, end)
+    touched = [cell for cell, _ in shares]
+    if not corner_cutting:
+        touched += [cell for pair in corners for cell in pair]
+    if not all(np.isfinite(pace[cell]) for cell in touched):
+        return math.inf
+    exact = sum(Fraction(float(pace[cell])) * share for cell, share in shares)
+    return float(exact) * math.dist(start, end)

@@ -151,17 +151,11 @@ class ExternalVehicle:
     """
 
     def __init__(
-        self,
-        simulation: Simulation,
-        name: str,
-        cell: int,
-        chance: random.Random,
-        open: Sequence[bool],
-        generations: MemoryGenerations | None = None,
+        self, simulation: Simulation, name: str, cell: int, chance: random.Random, open: Sequence[bool]
     ) -> None:
         self.simulation, self.name, self.cell, self.chance, self.open = simulation, name, cell, chance, open
         self.grid = simulation.terrain.grid
-        self.generations = generations or MemoryGenerations()
+        self.generations = MemoryGenerations()
         self.on: int | None = None
         self.moves = 0
         self.warnings: list[str] = []

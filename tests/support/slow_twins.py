@@ -48,7 +48,7 @@ def steps(
     return found
 
 
-def _legal_steps(
+def legal_steps(
     pace: NDArray[np.float32], neighbours: int, corner_cutting: bool
 ) -> Iterator[tuple[int, Cells, Cells]]:
     """For each direction: the cells from which a step leads there, and the cells to which it leads."""
@@ -82,7 +82,7 @@ def cost_to_go(
     left_share     share of a step that has the pace of the cell which it leaves: half of it in GRASS, none in ours
     """
     into, out, costs = [], [], []
-    for direction, here, there in _legal_steps(pace, neighbours, corner_cutting):
+    for direction, here, there in legal_steps(pace, neighbours, corner_cutting):
         length = step_length(direction, edge)
         left, entered = (pace.reshape(-1)[cells].astype(np.float64) for cells in (here, there))
         cost = (left_share * left + (1 - left_share) * entered) * length
@@ -112,7 +112,7 @@ def cost_to_go_in_float32(
     cell_cost  float32 (rows, cols), s; of the cheapest straight step into each cell
     """
     into: list[list[tuple[int, np.float32]]] = [[] for _ in range(cell_cost.size)]
-    for direction, out, to in _legal_steps(cell_cost, neighbours, corner_cutting):
+    for direction, out, to in legal_steps(cell_cost, neighbours, corner_cutting):
         prices = np.full(to.size, step_length(direction, edge), np.float32)
         if climb is not None:
             prices *= climb.along(out, to) / np.float32(climb.lowest)
@@ -150,49 +150,6 @@ def cost_to_go_by_hand(pace: NDArray[np.float32], target: int, **rules: object) 
             if key + cost < best[u]:
                 heapq.heappush(heap, (key + cost, u))
     return best.reshape(pace.shape)
-
-
-def way_down(pace: NDArray[np.float32], cost: NDArray[np.float64], start: int, most: int = 0) -> bytes:
-    """Directions of a cheapest route by the default rules to where cost is 0; `most` of them, if given."""
-    rows, cols = pace.shape
-    row, col = divmod(start, cols)
-    directions = bytearray()
-    while cost[row, col] > 0 and (not most or len(directions) < most):
-        best = (math.inf, 0, row, col)
-        for direction in range(8):
-            r, c = row + STEP_ROW[direction], col + STEP_COL[direction]
-            if not (0 <= r < rows and 0 <= c < cols) or math.inf in (pace[row, c], pace[r, col], pace[r, c]):
-                continue
-            best = min(best, (cost[r, c] + float(pace[r, c]) * step_length(direction, "octile"), direction, r, c))
-        _, direction, row, col = best
-        directions.append(direction)
-    return bytes(directions)
-
-
-def follow(
-    pace: NDArray[np.float32],
-    start: int,
-    directions: bytes,
-    neighbours: int = 8,
-    edge: str = "octile",
-    corner_cutting: bool = False,
-) -> tuple[int, float] | None:
-    """(last cell, cost) of a route on cells of one metre; None if it breaks a rule on the way."""
-    rows, cols = pace.shape
-    row, col = divmod(start, cols)
-    total = 0.0
-    for direction in directions:
-        r, c = row + STEP_ROW[direction], col + STEP_COL[direction]
-        if not (0 <= r < rows and 0 <= c < cols) or pace[r, c] == math.inf:
-            return None
-        if direction % 2:
-            if neighbours == 4:
-                return None
-            if not corner_cutting and (pace[row, c] == math.inf or pace[r, col] == math.inf):
-                return None
-        total += float(pace[r, c]) * step_length(direction, edge)
-        row, col = r, c
-    return row * cols + col, total
 
 
 class Driven(NamedTuple):

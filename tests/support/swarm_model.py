@@ -26,7 +26,6 @@ from swarm.wire.access import Authenticator
 from swarm.wire.topics import Topic
 
 START_NS = 1_000 * NS_PER_S
-TICK_NS = NS_PER_S // 10
 
 
 S = TypeVar("S", bound=Service)

@@ -13,15 +13,14 @@ from typing import get_args
 
 import numpy as np
 from numpy.typing import NDArray
-from support.planner_strategies import RULES, random_climb, random_pace
+from support.planner_play import Play
+from support.planner_strategies import RULES, Job, Marks, Move, random_climb, random_pace
 from support.slow_twins import Cells, Driven, cost_to_go, drive
 
 from planner_service.kernel_build import load_all
-from planner_service.target_tree import TargetTree
-from planner_service.tree.partitioned_tree import GrownTree
 from swarm.config.scenario import PlannerConfig
 from swarm.config.setting_types import Strategy
-from swarm.grid import GridSpec, Window
+from swarm.grid import GridSpec
 from swarm.wire.route_columns import LETHAL_START, OK, UNREACHABLE, RouteBatch
 
 Seconds = NDArray[np.float64]
@@ -90,12 +89,12 @@ class Life:
         self._seed = seed
         self._findings = findings
         rng = self._rng = np.random.default_rng(seed)
-        in_pieces = rng.random() < 0.25
+        in_pieces = bool(rng.random() < 0.25)
         rows, cols = (int(rng.integers(1, 161 if in_pieces else 49)) for _ in "rc")
         resolution_m = float(rng.choice([1.0, 0.1, 7.3, 30.0]))
         self._grid = GridSpec(rows, cols, resolution_m)
         ratio, walls = float(rng.choice([1.0, 3.0, 100.0, 1e4, 1e8])), float(rng.choice([0.0, 0.1, 0.3, 0.5]))
-        self._pace = random_pace(rng, rows, cols, ratio, walls)
+        pace = self._pace = random_pace(rng, rows, cols, ratio, walls)
         kind = int(rng.integers(2 if in_pieces else 3))
         relief_m, steepest = rng.choice([0.0, 0.1, 0.5]) * resolution_m, float(rng.choice([0.1, 0.3, 10.0]))
         self._climb = random_climb(rng, self._grid, relief_m, steepest) if kind == 2 else None
@@ -106,64 +105,31 @@ class Life:
             length_weight=float(10.0 ** rng.uniform(-6, 6)) if kind == 1 else 0.0,
             **RULES[rng.integers(len(RULES))],
         )
-        self._tree = TargetTree(self._grid, self.config, self._climb)
-        self._tree.times.in_pieces = in_pieces  # as if the map were large
-        self._target = int(rng.choice(np.flatnonzero(np.isfinite(self._pace))))
-        self._version = 0
-        self._grown: GrownTree | None = None
-        self._dirty: list[Window] = []
-        self._tree.update(self._pace, self._target, [], 0)
+        target = int(rng.choice(np.flatnonzero(np.isfinite(pace))))
+        self._play = Play(pace, self.config, climb=self._climb, grid=self._grid, target=target, in_pieces=in_pieces)
+        self._tree = self._play.tree
 
     def live(self) -> None:
+        rng, play = self._rng, self._play
         self._check()
-        for _ in range(int(self._rng.integers(4, 25))):
-            event = self._rng.random()
-            if event < 0.55:
-                self._move(1)
-            elif event < 0.65:
-                self._move(16)
+        for _ in range(int(rng.integers(4, 25))):
+            event = rng.random()
+            if event < 0.65:
+                most = 1 if event < 0.55 else 16
+                play.happen(Move(*rng.integers(-most, most + 1, 2).tolist()))
             elif event < 0.8:
-                self._mark()
+                play.happen(Marks(int(rng.integers(1 << 31)), int(rng.integers(1, 7))))
             elif event < 0.9:
-                self._job()
+                play.happen(Job("begin" if play.grown is None else "end"))
             elif event < 0.95:
                 self._tree.force(self._some(3))
             else:
-                self._tree.routes(self._some(5), int(self._rng.integers(9)))
+                self._tree.routes(self._some(5), int(rng.integers(9)))
                 self._tree.cost_to_go_at(self._some(5))
             self._check()
 
     def _some(self, most: int) -> Cells:
         return self._rng.integers(self._grid.cells, size=int(self._rng.integers(1, most + 1)))
-
-    def _move(self, most: int) -> None:
-        row, col = self._grid.row_col(self._target)
-        down, right = (int(by) for by in self._rng.integers(-most, most + 1, 2))
-        row = min(max(row + down, 0), self._grid.rows - 1)
-        col = min(max(col + right, 0), self._grid.cols - 1)
-        self._target = self._grid.cell(row, col)
-        self._tree.update(self._pace, self._target, [], self._version)
-
-    def _mark(self) -> None:
-        rng, dirty = self._rng, Window(0, 0, 0, 0)
-        for _ in range(int(rng.integers(1, 7))):
-            row, col = (int(rng.integers(side)) for side in self._pace.shape)
-            self._pace[row, col] = rng.choice(np.array([np.inf, 0.5, 1.0, 20.0, 500.0], np.float32))
-            dirty = dirty.union(Window(row, col, row + 1, col + 1))
-        self._version += 1
-        self._dirty.append(dirty)
-        self._tree.update(self._pace, self._target, [dirty], self._version)
-
-    def _job(self) -> None:
-        if self._grown is None:
-            self._grown = self._tree.full_job(self._target)()
-            self._dirty = []
-            return
-        followed = self._some(5)
-        self._tree.adopt(self._grown, self._pace, self._target, self._dirty, self._version, followed)
-        self._grown = None
-        if self._tree.wants_strides:
-            self._tree.take_strides(self._tree.stride_job()())
 
     def _check(self) -> None:
         if not self._tree.ready:
@@ -182,8 +148,8 @@ class Life:
         self._check_statuses(cut, best_s)
         there = np.flatnonzero(np.isfinite(best_s) & (whole.statuses == OK) & (cut.statuses == OK))
         driven, first = drive(*ground, whole), drive(*ground, cut)
-        self._note("legal", np.where(driven.last[there] == self._target, 0.0, math.inf), 0.0)
-        if not (driven.last[there] == self._target).all():
+        self._note("legal", np.where(driven.last[there] == self._play.target, 0.0, math.inf), 0.0)
+        if not (driven.last[there] == self._play.target).all():
             return
         self._check_stated(whole, cut, driven, first, there)
         for routes in (whole, cut):
@@ -198,7 +164,7 @@ class Life:
     def _best(self, length_weight: float = 0.0) -> Seconds:
         config, metres = self.config, self._grid.resolution_m
         rules = (config.neighbours, config.edge, config.corner_cutting)
-        return metres * cost_to_go(self._pace, self._target, *rules, self._climb, length_weight).reshape(-1)
+        return metres * cost_to_go(self._pace, self._play.target, *rules, self._climb, length_weight).reshape(-1)
 
     def _check_statuses(self, routes: RouteBatch, best_s: Seconds) -> None:
         expected = np.where(np.isfinite(best_s), OK, UNREACHABLE)

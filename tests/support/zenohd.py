@@ -5,11 +5,10 @@ from __future__ import annotations
 import json
 import os
 import shutil
-import subprocess
 from pathlib import Path
 
 import pytest
-from support.processes import eventually
+from support.processes import Child, eventually
 
 from launch_scripts.deploy.machine_archives import zenohd_config
 from swarm.bus.endpoints import listening
@@ -36,24 +35,12 @@ def plugins() -> str:
     pytest.skip(f"there is a zenohd, but no {PLUGIN} beside it or in ../lib")
 
 
-class Zenohd:
+class Zenohd(Child):
     """zenohd, under way, as `swarm deploy zenohd` configures it."""
 
     def __init__(self, folder: Path, network: NetworkConfig, plugins: str | None = None) -> None:
-        command = [zenohd(), "-c", str(folder / "zenohd.json5")]
+        config = folder / "zenohd.json5"
+        config.write_text(json.dumps(zenohd_config(network, plugins=plugins)))
+        super().__init__(folder / "zenohd.log", zenohd(), "-c", config)
         self.network = network
-        (folder / "zenohd.json5").write_text(json.dumps(zenohd_config(network, plugins=plugins)))
-        self.log = folder / "zenohd.log"
-        with self.log.open("w") as log:
-            self.process = subprocess.Popen(command, stdout=log, stderr=log)
         eventually(lambda: listening(network.listen[0]), 20, "zenohd to listen")
-
-    def __enter__(self) -> Zenohd:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.stop()
-
-    def stop(self) -> None:
-        self.process.kill()
-        self.process.wait(10)

@@ -10,15 +10,15 @@ import typer
 from numpy.typing import NDArray
 from scipy.sparse import csr_array
 from scipy.sparse.csgraph import dijkstra
+from support.kernel_oracle import loaded
 
 from bench.harness import Seed, benchmark, track
-from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
 from shared_map.array_files import Floats
 from shared_map.terrain.terrain import build_terrain
 from shared_map.vehicle_class_grounds import AirGround, air_ground, clearance_floor
 from swarm.config.ground import TerrainConfig
-from swarm.config.scenario import PlannerConfig, Scenario
+from swarm.config.scenario import Scenario
 from swarm.config.vehicle_classes import AirConfig
 from swarm.grid import STEP_COL, STEP_ROW, GridSpec
 
@@ -102,8 +102,8 @@ def _over_stack(
     floor = clearance_floor(heights, flight.clearance_m).ravel()
     surface = flown.height_m.astype(np.float64).ravel()
     up, down = 1 / flight.climb_m_per_s, 1 / flight.descent_m_per_s
-    tree, costs = _grown(grid, flown, root)
-    ours = tree.cost_at(costs.pad_all(starts))
+    tree = _grown(grid, flown, root)
+    ours = tree.cost_at(tree.cost_grid.pad_all(starts))
     ours = ours + (surface - floor)[starts] * up + (surface - floor)[root] * down
     levels = np.linspace(floor.min(), floor.max(), LEVELS)
     lowest = np.searchsorted(levels, floor - 1e-6)
@@ -140,12 +140,10 @@ def _stack(
     return found
 
 
-def _grown(grid: GridSpec, flown: AirGround, root: int) -> tuple[CostToGoTree, CostGrid]:
-    costs = CostGrid(grid, PlannerConfig(), flown.climb)
-    costs.load(flown.pace_s_per_m)
-    tree = CostToGoTree(costs)
+def _grown(grid: GridSpec, flown: AirGround, root: int) -> CostToGoTree:
+    tree = CostToGoTree(loaded(flown.pace_s_per_m, grid, flown.climb))
     tree.grow(root)
-    return tree, costs
+    return tree
 
 
 def _clearance(
@@ -158,10 +156,9 @@ def _clearance(
     """
     lowest_m, seen = math.inf, 0
     while seen < routes:
-        tree, costs = _grown(grid, flown, int(rng.choice(grid.cells)))
-        cells = np.arange(grid.cells)
-        parents = tree.parent[costs.pad_all(cells)]
-        for code, (south, east) in enumerate(zip(STEP_ROW, STEP_COL, strict=True)):
+        tree = _grown(grid, flown, int(rng.choice(grid.cells)))
+        parents = tree.parent[tree.cost_grid.pad_all(np.arange(grid.cells))]
+        for code, (south, east) in enumerate(_STEPS):
             tails, heads = _neighbours(grid, south, east)
             taken = parents[tails] == code
             under = heights.ravel()[tails[taken]]

@@ -8,13 +8,13 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 from numpy.typing import NDArray
+from support.kernel_oracle import loaded
 
 from bench.harness import Seed, benchmark, cpu_ms, numbers_of, track
-from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
 from shared_map.terrain.terrain import Terrain, build_terrain
 from swarm.config.ground import CostConfig, TerrainConfig
-from swarm.config.scenario import PlannerConfig, Scenario
+from swarm.config.scenario import Scenario
 from swarm.grid import Window
 
 _HALVES = (16, 32, 64)
@@ -53,8 +53,7 @@ class _Side:
 
     def __init__(self, terrain: Terrain) -> None:
         self.pace = terrain.pace_s_per_m.copy()
-        self.costs = CostGrid(terrain.grid, PlannerConfig(), terrain.climb)
-        self.costs.load(self.pace)
+        self.costs = loaded(self.pace, terrain.grid, terrain.climb)
         self.tree = CostToGoTree(self.costs)
         self.took_ms = 0.0
 

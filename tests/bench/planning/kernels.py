@@ -10,13 +10,12 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 from support.fields import Field, Pace, make_field, paces_of_any_ratio
+from support.kernel_oracle import loaded
 
 from bench.harness import FieldOption, Seed, benchmark, cpu_ms, track
-from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
 from planner_service.tree.route_bounds import LowerBounds, read_routes
-from swarm.config.scenario import PlannerConfig
-from swarm.grid import GridSpec, Window
+from swarm.grid import Window
 
 CHANGES: dict[str, float] = {"x 0.7": 0.7, "x 1.5": 1.5, "x 3": 3.0, "lethal": np.inf}
 """Changes of all paces of a patch."""
@@ -35,9 +34,8 @@ class _Bench:
         self.rng = np.random.default_rng(seed + 1)
         self.pace = pace
         self.field = Field(pace)
-        self.grid = GridSpec(pace.shape[0], pace.shape[1], 1.0)
-        self.cost_grid = CostGrid(self.grid, PlannerConfig())
-        self.cost_grid.load(pace)
+        self.grid = self.field.grid
+        self.cost_grid = loaded(pace)
         self.tree = CostToGoTree(self.cost_grid)
         self.bounds = LowerBounds(self.cost_grid)
         self.took: dict[str, list[float]] = {}
@@ -181,20 +179,14 @@ def _growths_of_any_ratio(pace: Pace, repeats: int, seed: int) -> list[dict[str,
     """
     rng = np.random.default_rng(seed + 2)
     roots = rng.choice(np.flatnonzero(np.isfinite(pace)), repeats).tolist()
-    usual = _tree(pace)
+    usual = CostToGoTree(loaded(pace))
     rows = []
     for name, paces in paces_of_any_ratio(pace, rng):
         took: tuple[list[float], list[float]] = [], []
-        other = _tree(paces)
+        other = CostToGoTree(loaded(paces))
         for root in (roots[0], *roots):
             for tree, times_ms in zip((usual, other), took, strict=True):
                 times_ms.append(cpu_ms(tree.grow, root))
         usual_ms, other_ms = (float(np.median(times_ms[1:])) for times_ms in took)
         rows.append({"costs": name, "growth_ms": round(other_ms, 3), "over_usual": round(other_ms / usual_ms, 2)})
     return rows
-
-
-def _tree(pace: Pace) -> CostToGoTree:
-    cost_grid = CostGrid(GridSpec(pace.shape[0], pace.shape[1], 1.0), PlannerConfig())
-    cost_grid.load(pace)
-    return CostToGoTree(cost_grid)

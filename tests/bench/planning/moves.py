@@ -10,13 +10,12 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 from support.fields import Field, make_field
+from support.kernel_oracle import loaded
 
 from bench.harness import FieldOption, Seed, benchmark, cpu_ms, track
 from planner_service.growth_times import exact_half
-from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
 from planner_service.tree.partitioned_tree import PartitionedTree
-from swarm.config.scenario import PlannerConfig
 
 Course = Literal["random", "straight"]
 COURSES: tuple[Course, ...] = ("random", "straight")
@@ -35,8 +34,7 @@ class _Walk:
         self._course = course
         self._rng = rng
         self._heading = int(rng.integers(8))
-        self.costs = CostGrid(field.grid, PlannerConfig())
-        self.costs.load(field.pace)
+        self.costs = loaded(field.pace)
         self.mended, self.grown = CostToGoTree(self.costs), CostToGoTree(self.costs)
         self.pieces = PartitionedTree(self.costs)
         self.cell = int(field.draw(1, rng)[0])

@@ -21,10 +21,12 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 from support.fields import Field, Pace, make_field
-from support.kernel_oracle import inner
+from support.kernel_oracle import inner, loaded
+from support.slow_twins import legal_steps
 
 from bench.harness import FieldOption, Seed, benchmark, track
 from bench.isolated import isolated, peak_bytes
+from planner_service.tree.cost_to_go import CostToGoTree
 
 Costs = NDArray[np.floating[Any]]
 
@@ -147,17 +149,9 @@ def breadth_first(pace: Pace) -> Tool:
     return Tool(lambda root: search(cost_grid.padded, cost, cost_grid.pad(root), queue), lambda *_: None)
 
 
-def _our_tree(pace: Pace) -> Any:
-    from planner_service.tree.cost_grid import CostGrid
-    from planner_service.tree.cost_to_go import CostToGoTree
-    from swarm.config.scenario import PlannerConfig
-    from swarm.grid import GridSpec
-
+def _our_tree(pace: Pace) -> CostToGoTree:
     # No other library forbids diagonals past lethal corners.
-    config = PlannerConfig(edge="paper", corner_cutting=True)
-    cost_grid = CostGrid(GridSpec(pace.shape[0], pace.shape[1], 1.0), config)
-    cost_grid.load(pace)
-    return CostToGoTree(cost_grid)
+    return CostToGoTree(loaded(pace, edge="paper", corner_cutting=True))
 
 
 def parental_field(pace: Pace) -> Tool:
@@ -208,20 +202,11 @@ def csgraph(pace: Pace) -> Tool:
     from scipy.sparse import csr_matrix
     from scipy.sparse.csgraph import dijkstra
 
-    rows, cols = pace.shape
-    cells = np.arange(pace.size).reshape(rows, cols)
-    free = np.isfinite(pace)
     into, out, costs = [], [], []
-    for dr in (-1, 0, 1):
-        for dc in (-1, 0, 1):
-            if not (dr or dc):
-                continue
-            here = np.s_[max(0, -dr) : rows - max(0, dr), max(0, -dc) : cols - max(0, dc)]
-            there = np.s_[max(0, dr) : rows + min(0, dr), max(0, dc) : cols + min(0, dc)]
-            legal = free[here] & free[there]
-            out.append(cells[here][legal])
-            into.append(cells[there][legal])
-            costs.append(pace[there][legal].astype(np.float64))
+    for _, here, there in legal_steps(pace, neighbours=8, corner_cutting=True):
+        out.append(here)
+        into.append(there)
+        costs.append(pace.reshape(-1)[there].astype(np.float64))
     edges = (np.concatenate(costs), (np.concatenate(into), np.concatenate(out)))
     del into, out, costs
     graph = csr_matrix(edges, shape=(pace.size, pace.size))

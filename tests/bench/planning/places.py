@@ -8,12 +8,12 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 from support.fields import Field, make_field
+from support.kernel_oracle import loaded
 
 from bench.harness import FieldOption, Seed, benchmark, cpu_ms, track
 from planner_service.goal_tree_cache import GoalTrees
-from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
-from swarm.config.scenario import PLACE_TREES_BYTES, PlannerConfig
+from swarm.config.scenario import PLACE_TREES_BYTES
 from swarm.grid import Window
 from swarm.wire.route_columns import RouteStatus
 
@@ -34,8 +34,7 @@ class _Asked:
     def __init__(self, field: Field, rng: np.random.Generator) -> None:
         self._field, self._rng = field, rng
         self._pace = field.pace.copy()
-        self._costs = CostGrid(field.grid, PlannerConfig())
-        self._costs.load(self._pace)
+        self._costs = loaded(self._pace)
         self._whole = CostToGoTree(self._costs)
         self.trees = GoalTrees(self._costs, PLACE_TREES_BYTES)
         self.ask(*self.pairs(1, 0)[0])  # scratch is made

@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import itertools
 import statistics
 import time
 from typing import Annotated, Any
 
 import numpy as np
 import typer
-from numpy.typing import NDArray
 from support.fields import Pace, make_field
+from support.segments import cost_s
 
 from bench.harness import Seed, benchmark, cpu_ms
 from planner_service.route_finder import PulledRoute, RouteFinder
@@ -19,7 +20,7 @@ from swarm.wire.route_columns import RouteStatus
 _ROUTES = 400
 """Number of routes for each tree."""
 _CHECKED = 20
-"""One route in this many is priced again, segment by segment, by `segment_cost_s`."""
+"""One route in this many is priced again, segment by segment, in fractions."""
 _STEPS = (130, 170)
 """Steps of the routes whose pulling is timed."""
 _EQUAL = 1e-9
@@ -91,27 +92,8 @@ def pulled(
     }
 
 
-def segment_cost_s(pace: Pace, start: NDArray[np.int64], end: NDArray[np.int64]) -> float:
-    """A segment's price where a metre is a cell, from all its crossings at once; inf where it may not be driven."""
-    steps = end - start
-    rows, cols = np.abs(steps)
-    whole = 2 * max(rows, 1) * max(cols, 1)
-    on_rows = (2 * np.arange(rows) + 1) * max(cols, 1)
-    on_cols = (2 * np.arange(cols) + 1) * max(rows, 1)
-    met = np.unique(np.concatenate(((0, whole), on_rows, on_cols)))
-    middles = met[:-1] + met[1:]  # over 2 * whole, as the centres of cells lie on even numbers
-    at = start + (middles[:, None] * steps + whole) // (2 * whole)
-    corner = np.isin(met[1:-1], on_rows) & np.isin(met[1:-1], on_cols)
-    before, after = at[:-1][corner], at[1:][corner]
-    beside = np.concatenate((pace[before[:, 0], after[:, 1]], pace[after[:, 0], before[:, 1]]))
-    crossed = pace[at[:, 0], at[:, 1]].astype(np.float64)
-    if not (np.isfinite(crossed).all() and np.isfinite(beside).all()):
-        return np.inf
-    return float((crossed * np.diff(met)).sum() / whole * np.hypot(rows, cols))
-
-
 def _holds(pace: Pace, pulled: PulledRoute) -> bool:
-    again = sum(segment_cost_s(pace, a, b) for a, b in zip(pulled.turns, pulled.turns[1:], strict=False))
+    again = sum(cost_s(pace, a, b) for a, b in itertools.pairwise(map(tuple, pulled.turns.tolist())))
     return abs(again - pulled.cost_s) <= _EQUAL * pulled.cost_s
 
 

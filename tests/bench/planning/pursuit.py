@@ -8,12 +8,12 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 from support.fields import Field, make_field
+from support.kernel_oracle import loaded
 from support.single_paths import SinglePaths
 
 from bench.harness import FieldOption, Seed, benchmark, track
 from bench.planning.chase import follow
 from planner_service.target_tree import TargetTree
-from planner_service.tree.cost_grid import CostGrid
 from swarm.config.scenario import PlannerConfig
 
 NEAR_CELLS = 4
@@ -40,9 +40,7 @@ def pursuit(
     """
     made = Field(make_field(field, size, seed))
     rng = np.random.default_rng(seed + 1)
-    costs = CostGrid(made.grid, PlannerConfig())
-    costs.load(made.pace)
-    tree, others = TargetTree(made.grid, PlannerConfig()), SinglePaths(costs)
+    tree, others = TargetTree(made.grid, PlannerConfig()), SinglePaths(loaded(made.pace))
     target, vehicle = made.draw(2, rng).tolist()
 
     def ours(vehicle: int, target: int) -> float:

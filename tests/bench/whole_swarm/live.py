@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from support.far_processes import Far
-from support.process_usage import cpu_s, in_session, machine_cpu_s, pss_bytes
+from support.processes import cpu_s, in_session, machine_cpu_s, pss_bytes
 from support.up_process import UpProcess
 
 from bench.harness import tell

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import threading
 import time
 from collections.abc import Iterable
 from contextlib import closing
@@ -11,8 +10,9 @@ from typing import Any
 
 import numpy as np
 import zenoh
-from support.far_processes import Far, asked
+from support.far_processes import Far, answered, asked
 from support.made_up_swarm import some_fleet
+from support.makers import target_pose
 
 from bench.wire.remote import RAW, Parts, beside, read_on_thread, run_service
 from planner_service.planning_process import Planning
@@ -26,7 +26,7 @@ from swarm.runtime.inbox import Inbox
 from swarm.runtime.process import ThreadWorker
 from swarm.runtime.role_setup import RoleSetup
 from swarm.wire.codec import encode
-from swarm.wire.messages.planning import RouteReply, RouteRequest, TargetPose
+from swarm.wire.messages.planning import RouteReply, RouteRequest
 from swarm.wire.messages.vehicles import Fleet
 from swarm.wire.route_columns import RouteStatus
 from swarm.wire.topics import FLEET, POSE, ROUTE
@@ -128,7 +128,7 @@ def _raw_ns(bus: ZenohBus, payload: bytes, size: int) -> int | None:
 def _wait_for_route(bus: ZenohBus, inbox: Inbox) -> None:
     deadline_s = time.monotonic() + _LONGEST_S
     cell = _SIDE * _SIDE // 2 + _SIDE // 2
-    pose = TargetPose(target=_TARGET, incarnation=1, seq=1, stamp_ns=time.time_ns(), cell=cell, x_m=0.0, y_m=0.0)
+    pose = target_pose(_TARGET, cell, stamp_ns=time.time_ns())
     while time.monotonic() < deadline_s:
         bus.publish(POSE, pose, target=_TARGET)
         reply = ask_route(bus, inbox, RouteRequest(cells=[0]))
@@ -182,7 +182,7 @@ def fleet_sender(network: NetworkConfig, pipe: Connection, first: int, vehicles:
 
 def _fleet(agent: int, seq: int, vehicles: int) -> Fleet:
     places = np.linspace(0.0, 1000.0, vehicles) + seq
-    return some_fleet(f"a{agent}", agent, seq, places, places, places, [_TARGET])
+    return some_fleet(f"a{agent}", agent, seq, places, places, places, _TARGET)
 
 
 def watcher_peer(network: NetworkConfig, pipe: Connection) -> None:
@@ -217,7 +217,9 @@ def positions(far: Far, agents: int, vehicles: int, seconds: float) -> dict[str,
     for name, raw in (("raw", True), ("ours", False)):
         before = asked(watcher, "counts")
         began_s = time.monotonic()
-        sent = sum(_all_answers(senders, (raw, seconds), seconds))
+        for sender in senders:
+            sender.send((raw, seconds))
+        sent = sum(answered(sender, "the question for positions", seconds + _LONGEST_S) for sender in senders)
         time.sleep(0.3)
         took_s = time.monotonic() - began_s - 0.3
         received, superseded, raw_count, cpu_ns = (
@@ -234,19 +236,3 @@ def positions(far: Far, agents: int, vehicles: int, seconds: float) -> dict[str,
         far.end()
     figures["ratio_cpu_ms_per_s"] = figures["ours_cpu_ms_per_s"] / figures["raw_cpu_ms_per_s"]
     return {name: round(float(value), 2) for name, value in figures.items()}
-
-
-def _all_answers(pipes: list[Connection], question: Any, seconds: float) -> list[int]:
-    answers: dict[int, int] = {}
-
-    def ask(n: int) -> None:
-        answers[n] = asked(pipes[n], *question, within_s=seconds + _LONGEST_S)
-
-    threads = [threading.Thread(target=ask, args=(n,)) for n in range(len(pipes))]
-    for thread in threads:
-        thread.start()
-    for thread in threads:
-        thread.join()
-    if len(answers) < len(pipes):
-        raise SwarmError("a process that tells positions did not answer")
-    return list(answers.values())

@@ -2,59 +2,24 @@
 
 from __future__ import annotations
 
-import contextlib
-import subprocess
-import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any
 
 import psutil
 import typer
-from support.far_processes import Far
+from support.far_processes import Far, on_free_port
 from support.made_up_swarm import swarm_peer
+from support.ros_peer import Gateway
 
 from bench.harness import benchmark, track
-from launch_scripts.ports import free_ports
 from swarm.bus.zenoh_bus import open_bus
-from swarm.config.scenario import NetworkConfig
-from swarm.errors import SwarmError
 
 _WARM_S = 3.0
-_START_S = 60.0
-
-
-@contextlib.contextmanager
-def _gateway(swarm: str, ros: str, folder: Path) -> Iterator[subprocess.Popen[str]]:
-    program = "import sys; from launch_scripts.cli import main; sys.exit(main())"
-    command = [
-        sys.executable,
-        "-c",
-        program,
-        "gateway",
-        "ros2",
-        "--connect",
-        swarm,
-        "--namespace",
-        "bench",
-        "--ros",
-        ros,
-    ]
-    with (folder / "ros2.log").open("w") as log:
-        process = subprocess.Popen([*command, "--runs", str(folder)], stdout=log, stderr=log, text=True)
-    try:
-        until_s = time.monotonic() + _START_S
-        while "run bench" not in (said := (folder / "ros2.log").read_text()):
-            if process.poll() is not None or time.monotonic() > until_s:
-                raise SwarmError(f"the gateway does not start: {said.strip()}")
-            time.sleep(0.1)
-        yield process
-    finally:
-        process.kill()
-        process.wait(10)
+_LASTS_S = 120.0
+"""Life of the swarm, beside the measurement."""
 
 
 @benchmark()
@@ -71,16 +36,16 @@ def ros2(
     """
     from launch_scripts.gateways.ros2.ros_node import open_ros
 
-    endpoint = f"tcp/127.0.0.1:{free_ports(1)[0]}"
-    ros_side = NetworkConfig(namespace="ros", listen=(endpoint,), connect=(endpoint,))
+    ros_side = on_free_port("ros")
     heard: Counter[str] = Counter()
     with Far() as far, open_bus(ros_side, mode="router"), tempfile.TemporaryDirectory() as folder:
-        far.start(swarm_peer, vehicles, 2 * _START_S + seconds)
-        with open_ros(endpoint) as hearer:
+        far.start(swarm_peer, vehicles, _LASTS_S + seconds)
+        with open_ros(ros_side.connect[0]) as hearer:
             subscriber = hearer.declare_subscriber("0/**", lambda sample: heard.update([str(sample.key_expr)]))
-            with _gateway(far.network.connect[0], endpoint, Path(folder)) as process:
+            words = ("--namespace", "bench", "--runs", folder)
+            with Gateway(far.network.connect[0], ros_side.connect[0], Path(folder), *words) as begun:
                 time.sleep(_WARM_S)
-                before, gateway = heard.copy(), psutil.Process(process.pid)
+                before, gateway = heard.copy(), psutil.Process(begun.process.pid)
                 used, began_s = gateway.cpu_times(), time.monotonic()
                 for _ in track(range(10)):
                     time.sleep(seconds / 10)

@@ -544,7 +544,7 @@ def test_an_observer_sees_vehicles_targets_marks_and_captures(world: Swarm) -> N
 
 def test_an_observer_sees_the_vehicles_of_an_agent_until_it_is_silent(world: Swarm) -> None:
     watching = Program(world, "watcher").swarm.observer()
-    fleet = some_fleet("a0", 0, 1, [GRID.cell(2, 3)], [35.0], [25.0], ["t"])
+    fleet = some_fleet("a0", 0, 1, [GRID.cell(2, 3)], [35.0], [25.0], "t")
     world.ear.bus.publish(FLEET, fleet, region=0, author=fleet.author)
     world.run(0.5)
     (seen,) = watching.vehicles.values()
