@@ -313,7 +313,7 @@ class FiguresPanel:
             "captures_and_marks": [state.captures, None if state.marks is None else state.marks / 100],
             "gap": [None if gap is None else (gap - 1) * 100 for gap in gaps],
             "growth_ms": [None if line is None else line.growth_ms for line in lines],
-            "messages": [state.messages_per_s],
+            "messages": [state.messages_now_per_s],
         }
         for chart, values in charts.items():
             if any(value is not None for value in values):

@@ -388,7 +388,9 @@ class Recorder:
         _, waiting_s, standing_s = self.driven.totals.sum(axis=1).tolist()
         shown = {
             "t_s": state.elapsed_s,
-            **{name: getattr(state, name) for name in ("captures", "marks", "messages_per_s")},
+            "captures": state.captures,
+            "marks": state.marks,
+            "messages_per_s": state.messages_now_per_s,
             **state.states,
             "growth_ms_mean": _mean(line.growth_ms for line in state.targets),
         }
@@ -421,7 +423,7 @@ class Recorder:
             "vehicles": self.scenario.vehicle_count,
             "aloft": [each.name for each in self.scenario.groups if flies(self.scenario, each.vehicle_class)],
             "targets": len(self.scenario.target_ids),
-            "processes": state.well[1],
+            "processes": state.processes_well[1],
             "startup_s": startup_s,
             "vehicles_routed": len(self.routed),
             **for_report(state),

@@ -273,7 +273,7 @@ def test_no_fact_shown_in_two_places_differs(scenario: Scenario, plan: Callable[
 
     vehicles = watched.logged.details("world/vehicles")
     does = {name: sum(f": {name}" in text for text in vehicles) for name in state.states}
-    assert len(vehicles) == state.driven[0]
+    assert len(vehicles) == state.vehicles_driven[0]
     assert does == state.states
 
     # The end: what the recording shows last is what the report says.

@@ -387,10 +387,10 @@ def test_messages_per_second_are_what_the_processes_that_live_say(recorder: Reco
     for second in range(4):
         told = [stats("agent", id, 1, second, gauges={"messages_per_s": 25.0}) for id in ("a0", "a1")]
         hear(recorder, *told, at_s=float(second))
-    assert recorder.summary(3 * NS_PER_S).messages_per_s == 50.0
+    assert recorder.summary(3 * NS_PER_S).messages_now_per_s == 50.0
     assert recorder.report()["messages_per_s"] == pytest.approx(50.0, rel=0.2)
     recorder.alive(Peer("agent", "a1", 1), False, 3 * NS_PER_S)
-    assert recorder.summary(3 * NS_PER_S).messages_per_s == 25.0
+    assert recorder.summary(3 * NS_PER_S).messages_now_per_s == 25.0
 
 
 def test_tracks_forget_every_second_sampling_instead_of_growing() -> None:
