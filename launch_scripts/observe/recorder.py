@@ -427,6 +427,7 @@ class Recorder:
             "startup_s": startup_s,
             "vehicles_routed": len(self.routed),
             **for_report(state),
+            "external_seen": observed.external_seen(),
             "tracking": observed.tracking(),
             "stranded": state.states["stranded"] if observed.fleet_ns is not None else None,
             "lost": state.states["lost"] if observed.fleet_ns is not None else None,

@@ -82,7 +82,7 @@ def _word(value: str | None) -> str:
 
 @dataclass(frozen=True, slots=True)
 class Fact:
-    """How people read a field of a `RunState`, or of a `TargetLine`, where it is a column. The field's type has it.
+    """Label and text of a field of a `RunState`, or of a `TargetLine`, of which it is a column.
 
     label   what people call it
     text    its value in words; None where it is not known

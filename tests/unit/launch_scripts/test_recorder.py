@@ -104,9 +104,13 @@ def status(target: str, gap_max: float | None, following: int = 1) -> PlannerSta
     return planner_status(target, stamp_ns=0, following=following, **gaps)
 
 
-def test_an_external_vehicle_is_named_until_its_lease_ends(recorder: Recorder) -> None:
+def test_an_external_vehicle_is_named_until_its_lease_ends_and_the_report_names_it_for_good(
+    recorder: Recorder,
+) -> None:
     hear(recorder, Obstacle(id="rover", incarnation=1, seq=1, x_m=0.0, y_m=0.0, radius_m=1.0, lease_s=2.0))
     assert [recorder.summary(int(at_s * NS_PER_S)).external for at_s in (1.9, 2.1)] == [("rover",), ()]
+    recorder.finish(9 * NS_PER_S)
+    assert (recorder.report()["external"], recorder.report()["external_seen"]) == ((), ["rover"])
 
 
 def test_what_nobody_told_of_is_null_and_not_zero(recorder: Recorder) -> None:
