@@ -19,13 +19,11 @@ from rasterio.features import rasterize
 from rasterio.transform import from_origin
 from support.command import Swarm
 from support.fake_run import BEGAN_NS, little_scenario, played
-from support.map_strategies import set_of
 
 from launch_scripts.observe.recorder import BegunRoute, Recorder
 from launch_scripts.report.gis_formats import in_degrees, write_layers
 from launch_scripts.report.report_and_tracks import TRACKS_FILE, Track, packed_tracks, read_tracks, tracks_in
 from launch_scripts.report.run_gis_layers import ENDINGS, mark_layer, target_tracks, vehicle_tracks
-from shared_map.keeper.mark_store import KeeperStore
 from shared_map.terrain.map_frame import MapFrame
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.clock import NS_PER_S
@@ -34,7 +32,6 @@ from swarm.grid import GridSpec, walk
 from swarm.wire.messages.map_data import MarkKind
 
 GRID = GridSpec(48, 64, 25.0, 500_000.0, 5_200_000.0, "EPSG:32632")
-LETHAL_CELLS = {(3, 4), (3, 5), (4, 5), (9, 9)}
 
 
 @pytest.fixture(scope="module")
@@ -51,15 +48,6 @@ def run(recorder: Recorder, tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("runs") / "r1"
     folder.mkdir()
     (folder / TRACKS_FILE).write_bytes(packed_tracks(recorder))
-    with KeeperStore(folder / "map.sqlite") as store:
-        store.bind("fedcba9876543210", GRID)
-        marks: dict[int, tuple[MarkKind, float, int]] = {
-            row * 32 + col: (MarkKind.LETHAL, 0, BEGAN_NS) for row, col in LETHAL_CELLS
-        }
-        marks |= {
-            20 * 32 + col: (MarkKind.PACE, pace, BEGAN_NS + NS_PER_S) for col, pace in ((1, 0.5), (2, 0.5001))
-        }
-        store.save([set_of("a1.1", 0, 1, marks)])
     return folder
 
 
