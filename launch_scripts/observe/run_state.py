@@ -68,10 +68,6 @@ def factors(value: Mapping[str, float]) -> str:
     return ", ".join(f"{name} x {factor:.2g}" for name, factor in value.items()) or "nothing"
 
 
-def _gap(value: CertifiedGap | Mapping[str, float | None]) -> str:
-    return gap_text(value.fields() if isinstance(value, CertifiedGap) else value)
-
-
 def _mean_gap(value: CertifiedGap | None) -> str:
     return NONE if value is None else percent(value.mean)
 
@@ -169,6 +165,7 @@ class RunState:
     reroute_requests    how often a vehicle's own route did not lead it on, so that it asked for another
     routes_served       routes that planners gave in answer to questions; those which they pushed come on top
     certified_gap       how far above the optimum the routes that vehicles began can be at most, as proven
+                        (`CertifiedGap.fields`)
     learned             class of ground -> measured factor on its prior pace; only classes whose factor is not 1
     collisions          two vehicles on one cell; must be 0
     lethal_entries      vehicles on cells that are lethal in truth; must be 0
@@ -196,7 +193,7 @@ class RunState:
     marks: Annotated[int | None, Fact("marks", count)]
     reroute_requests: Annotated[int | None, Fact("re-route requests", count)]
     routes_served: Annotated[int | None, Fact("routes served", count)]
-    certified_gap: Annotated[CertifiedGap, Fact("certified gap", _gap)]
+    certified_gap: Annotated[dict[str, float | None], Fact("certified gap", gap_text)]
     learned: Annotated[dict[str, float], Fact("learned", factors)]
     collisions: Annotated[int | None, Fact("collisions", count)]
     lethal_entries: Annotated[int | None, Fact("lethal cells entered", count)]
@@ -269,7 +266,7 @@ def state_of(latest: LatestState, now_ns: int) -> RunState:
         restarts=round(latest.gauge(RESTARTS) or 0),
         crew={role: (alive[role], expected[role]) for role in expected},
         beside=dict(Counter(role for role, id in latest.up() if (role, id) not in needed)),
-        certified_gap=certified_gap(latest),
+        certified_gap=certified_gap(latest).fields(),
         learned=_learned(latest),
         alarms=alarms_of(latest, targets, now_ns),
         orders=tuple(map(plain, latest.book.standing)),
@@ -410,7 +407,6 @@ def for_report(state: RunState) -> dict[str, Any]:
     """Every fact by its name, for a report, and every alarm."""
     return {
         **{each.name: getattr(state, each.name) for each in FACTS},
-        "certified_gap": state.certified_gap.fields(),
         "alarms": [alarm.fields(state.grid) for alarm in state.alarms],
     }
 
