@@ -18,37 +18,22 @@ from pyogrio import raw
 from rasterio.features import rasterize
 from rasterio.transform import from_origin
 from support.command import Swarm
-from support.fake_run import BEGAN_NS, little_scenario, played
+from support.fake_run import BEGAN_NS, GRID
 
 from launch_scripts.observe.recorder import BegunRoute, Recorder
 from launch_scripts.report.gis_formats import in_degrees, write_layers
 from launch_scripts.report.report_and_tracks import TRACKS_FILE, Track, packed_tracks, read_tracks, tracks_in
 from launch_scripts.report.run_gis_layers import ENDINGS, mark_layer, target_tracks, vehicle_tracks
 from shared_map.terrain.map_frame import MapFrame
-from shared_map.terrain.terrain import terrain_of_pace
 from swarm.clock import NS_PER_S
 from swarm.errors import StoreError
 from swarm.grid import GridSpec, walk
 from swarm.wire.messages.map_data import MarkKind
 
-GRID = GridSpec(48, 64, 25.0, 500_000.0, 5_200_000.0, "EPSG:32632")
 
-
-@pytest.fixture(scope="module")
-def recorder() -> Recorder:
-    scenario = little_scenario(8.0, vehicles=4, time_scale=1)
-    terrain = dataclasses.replace(terrain_of_pace(np.full((48, 64), 0.1, np.float32), 25.0), grid=GRID)
-    truth = np.array(terrain.pace_s_per_m)
-    truth[20:26, 10:40], truth[5:12, 45:55] = np.inf, 0.3
-    return played(terrain, truth, scenario)
-
-
-@pytest.fixture(scope="module")
-def run(recorder: Recorder, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("runs") / "r1"
-    folder.mkdir()
-    (folder / TRACKS_FILE).write_bytes(packed_tracks(recorder))
-    return folder
+@pytest.fixture
+def recorder(left_run: tuple[Path, Recorder]) -> Recorder:
+    return left_run[1]
 
 
 def read_layers(folder: Path) -> dict[str, list[Any]]:
