@@ -101,9 +101,8 @@ class TargetsService(MemberService):
 
     def start(self, now_ns: int) -> None:
         self._member.join()
-        self._bus.subscribe(FLEET, self._post)
-        self._bus.subscribe(OBSTACLE, self._post)
-        self._bus.subscribe(STATUS, self._post)
+        for topic in (FLEET, OBSTACLE, STATUS):
+            self._bus.subscribe(topic, self._post)
         self._bus.watch_alive(self._post, role="planner")
         self._subscribe_targets()
         self._order_client.start(now_ns)
