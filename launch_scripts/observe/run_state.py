@@ -21,7 +21,6 @@ from launch_scripts.plain_text import Duration, first_of, number_of, plain
 from swarm.clock import NS_PER_S
 from swarm.config.explain import hints_of
 from swarm.config.vehicle_classes import GROUND
-from swarm.grid import GridSpec
 from swarm.runtime.stats import CAPTURES_OF, LEARNED, MESSAGES_PER_S, RESTARTS
 from swarm.wire.messages.orders import GoalState
 
@@ -210,7 +209,6 @@ class RunState:
     alarms: tuple[Alarm, ...]
     orders: tuple[str, ...]
     goals: tuple[GoalState, ...]
-    grid: GridSpec
 
     @property
     def standing_alarms(self) -> tuple[Alarm, ...]:
@@ -272,7 +270,6 @@ def state_of(latest: LatestState, now_ns: int) -> RunState:
         orders=tuple(map(plain, latest.book.standing)),
         sent=dict(Counter(goal.state for goal in goals)),
         goals=tuple(goals),
-        grid=latest.grid,
         **{name: latest.total(name) for name in _TOTALS},
     )
 
@@ -362,27 +359,25 @@ def alarm_lines(state: RunState, most: int, *, over: bool = False) -> list[str]:
 
     over  also closed alarms
     """
-    return lines_of(state.alarms if over else state.standing_alarms, state.grid, most)
+    return lines_of(state.alarms if over else state.standing_alarms, most)
 
 
-def lines_of(alarms: Iterable[Alarm], grid: GridSpec, most: int) -> list[str]:
+def lines_of(alarms: Iterable[Alarm], most: int) -> list[str]:
     """Alarms in lines for people, and how many lines are left out."""
-    found = [line for line, _ in grouped(alarms, grid)]
+    found = [line for line, _ in grouped(alarms)]
     return [*found[:most], f"... {len(found) - most} more"] if len(found) > most else found
 
 
-def grouped(alarms: Iterable[Alarm], grid: GridSpec) -> list[tuple[str, list[str]]]:
+def grouped(alarms: Iterable[Alarm]) -> list[tuple[str, list[str]]]:
     """Lines for people, and the lines that each sums up. Many alarms of a kind, all over or all not, are in one
     line; among its own lines, many alarms of one process are in one, too."""
     return [
-        (line, [own for own, _ in _summed(of_kind, lambda alarm: alarm.about, grid)] if len(of_kind) > 1 else [])
-        for line, of_kind in _summed(alarms, lambda alarm: (alarm.kind, alarm.lasts), grid)
+        (line, [own for own, _ in _summed(of_kind, lambda alarm: alarm.about)] if len(of_kind) > 1 else [])
+        for line, of_kind in _summed(alarms, lambda alarm: (alarm.kind, alarm.lasts))
     ]
 
 
-def _summed(
-    alarms: Iterable[Alarm], key: Callable[[Alarm], Hashable], grid: GridSpec
-) -> Iterator[tuple[str, list[Alarm]]]:
+def _summed(alarms: Iterable[Alarm], key: Callable[[Alarm], Hashable]) -> Iterator[tuple[str, list[Alarm]]]:
     """Returns lines and the alarms of each: many alarms of one key are in one line."""
     keys: dict[Hashable, list[Alarm]] = {}
     for alarm in alarms:
@@ -391,7 +386,7 @@ def _summed(
         if len(some) > _SAID_SINGLY:
             yield together(some), some
         else:
-            yield from ((each.line(grid), [each]) for each in some)
+            yield from ((each.line, [each]) for each in some)
 
 
 def together(alarms: Sequence[Alarm]) -> str:
@@ -407,7 +402,7 @@ def for_report(state: RunState) -> dict[str, Any]:
     """Every fact by its name, for a report, and every alarm."""
     return {
         **{each.name: getattr(state, each.name) for each in FACTS},
-        "alarms": [alarm.fields(state.grid) for alarm in state.alarms],
+        "alarms": [alarm.fields() for alarm in state.alarms],
     }
 
 

@@ -490,7 +490,7 @@ def test_many_alarms_of_one_process_share_a_line_among_those_of_their_kind() -> 
 
     of_keeper = [behind("keeper-0", 10.0 * n, 10.0 * n + 1 + n % 3) for n in range(5)]
     others = [behind("agent-a0", 3.0, 5.0), behind("planner-t0", 3.0, 4.0)]
-    [(line, parts)] = facts.grouped([*of_keeper, *others], GRID)
+    [(line, parts)] = facts.grouped([*of_keeper, *others])
     names = "keeper-0, agent-a0, planner-t0"
     assert line == f"behind: 7 times, {names}, the longest at 20 s of the run, for 3 s (overloaded machine)"
     assert parts == [
@@ -498,4 +498,4 @@ def test_many_alarms_of_one_process_share_a_line_among_those_of_their_kind() -> 
         "behind: agent-a0 skips, at 3 s of the run, for 2 s",
         "behind: planner-t0 skips, at 3 s of the run, for 1 s",
     ]
-    assert facts.grouped(others, GRID) == [(line, []) for line in parts[1:]], "few are said one by one"
+    assert facts.grouped(others) == [(line, []) for line in parts[1:]], "few are said one by one"
