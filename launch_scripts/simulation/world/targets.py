@@ -154,7 +154,7 @@ class TargetWorld:
         plugin = find_plugin(walk_named_by(config, key), scenario.plugin_folder)
         world = walks.WalkWorld(id, self._terrain, chance, self._budget)
         walk = walks.walk_of(plugin, world, lambda fault: self.faults.append(f"target {id}: {fault}"))
-        walker = walks.Walker(id, walk, walks.slowness_of(config, scenario.cost), cell)
+        walker = walks.Walker(self._terrain, walk, walks.slowness_of(config, scenario.cost), cell)
         return _Target(config, walker, *self._grid.centre_m(cell), chance)
 
     def obey(self, book: OrderBook, scenario: Scenario, now_ns: int, *, first: bool) -> list[Action]:
@@ -280,7 +280,7 @@ class TargetWorld:
             if not target.config.is_simulated or (waited_ns < patience_ns and not target.placed):
                 continue
             if target.placed:
-                target.walker.advance(self._terrain, elapsed_s, lambda: self._referee.cells)
+                target.walker.advance(elapsed_s, lambda: self._referee.cells)
             target.placed = True
             pose = self._pose(id, target, now_ns)
             self._refer(pose, now_ns)
@@ -292,7 +292,7 @@ class TargetWorld:
             self._referee.hear_obstacle(obstacle, now_ns)
 
     def _pose(self, id: str, target: _Target, now_ns: int) -> TargetPose:
-        target.x_m, target.y_m = target.walker.position_m(self._terrain)
+        target.x_m, target.y_m = target.walker.position_m()
         target.seq += 1
         return TargetPose(
             target=id,
