@@ -79,15 +79,17 @@ def _word(value: str | None) -> str:
 class Fact:
     """Label and text of a field of a `RunState`, or of a `TargetLine`, of which it is a column.
 
-    label   what people call it
-    text    its value in words; None where it is not known
-    always  whether every table of targets has the column; else `swarm status` alone
-    name    of the field, in the report and for programs
+    label     what people call it
+    text      its value in words; None where it is not known
+    always    whether every table of targets has the column; else `swarm status` alone
+    is_total  it is the count of its name, summed over all processes
+    name      of the field, in the report and for programs
     """
 
     label: str
     text: Callable[[Any], str]
     always: bool = True
+    is_total: bool = False
     name: str = ""
 
     def shown(self, state: RunState | TargetLine) -> str:
@@ -97,6 +99,11 @@ class Fact:
     def labelled(self, state: RunState) -> str:
         """The same after its label."""
         return f"{self.label} {self.shown(state)}"
+
+
+def total(label: str) -> Fact:
+    """The fact of a field which is a count, summed over all processes."""
+    return Fact(label, count, is_total=True)
 
 
 @dataclass(frozen=True, slots=True)
@@ -188,21 +195,21 @@ class RunState:
     following: Annotated[int, Fact("assigned", count)]
     sent: Annotated[dict[str, int], Fact("sent to places", each)]
     external: Annotated[tuple[str, ...], Fact("external vehicles", first_of)]
-    captures: Annotated[int | None, Fact("captures", count)]
-    marks: Annotated[int | None, Fact("marks", count)]
-    reroute_requests: Annotated[int | None, Fact("re-route requests", count)]
-    routes_served: Annotated[int | None, Fact("routes served", count)]
+    captures: Annotated[int | None, total("captures")]
+    marks: Annotated[int | None, total("marks")]
+    reroute_requests: Annotated[int | None, total("re-route requests")]
+    routes_served: Annotated[int | None, total("routes served")]
     certified_gap: Annotated[dict[str, float | None], Fact("certified gap", gap_text)]
     learned: Annotated[dict[str, float], Fact("learned", factors)]
-    collisions: Annotated[int | None, Fact("collisions", count)]
-    lethal_entries: Annotated[int | None, Fact("lethal cells entered", count)]
-    driven_into: Annotated[int | None, Fact("obstacles driven into", count)]
-    hit_by_obstacles: Annotated[int | None, Fact("vehicles hit by obstacles", count)]
+    collisions: Annotated[int | None, total("collisions")]
+    lethal_entries: Annotated[int | None, total("lethal cells entered")]
+    driven_into: Annotated[int | None, total("obstacles driven into")]
+    hit_by_obstacles: Annotated[int | None, total("vehicles hit by obstacles")]
     processes_well: Annotated[tuple[int, int], Fact("needed processes", of_all)]
     processes_ended: Annotated[int, Fact("of these ended as asked", count)]
     restarts: Annotated[int, Fact("restarts", count)]
     messages_now_per_s: Annotated[float | None, Fact("messages/s", count)]
-    payloads_dropped: Annotated[int | None, Fact("payloads dropped", count)]
+    payloads_dropped: Annotated[int | None, total("payloads dropped")]
     crew: dict[str, tuple[int, int]]
     beside: dict[str, int]
     targets: tuple[TargetLine, ...]
@@ -230,13 +237,6 @@ fact = {fact.name: fact for fact in FACTS}.__getitem__
 def _by_class(ids: Collection[str], classes: Mapping[str, str]) -> dict[str, int]:
     counts = Counter(classes[id] for id in ids)
     return {name: counts[name] for name in sorted(counts, key=lambda name: (name != GROUND, name))}
-
-
-_TOTALS = (
-    "captures", "collisions", "lethal_entries", "driven_into", "hit_by_obstacles", "reroute_requests",
-    "routes_served", "marks", "payloads_dropped",
-)  # fmt: skip
-"""Fields of a `RunState` which are counts of that name, summed over all processes."""
 
 
 def state_of(latest: LatestState, now_ns: int) -> RunState:
@@ -270,7 +270,7 @@ def state_of(latest: LatestState, now_ns: int) -> RunState:
         orders=tuple(map(plain, latest.book.standing)),
         sent=dict(Counter(goal.state for goal in goals)),
         goals=tuple(goals),
-        **{name: latest.total(name) for name in _TOTALS},
+        **{fact.name: latest.total(fact.name) for fact in FACTS if fact.is_total},
     )
 
 
