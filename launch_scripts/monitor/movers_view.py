@@ -9,7 +9,6 @@ Few entities with many instances each; of each only changes: see docs/design/liv
 
 from __future__ import annotations
 
-from bisect import bisect_left
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -466,8 +465,8 @@ class MoversView:
         if self._follow is None:
             return
         place_m = self._observed.targets().get(self._follow)
-        n = bisect_left(vehicles.ids, self._follow)
-        if n < len(vehicles) and vehicles.ids[n] == self._follow:
+        if self._follow in vehicles.ids:
+            n = vehicles.ids.index(self._follow)
             place_m = float(vehicles.east_m[n]), float(vehicles.south_m[n])
         if place_m is not None:
             self._log_followed(place_m)
