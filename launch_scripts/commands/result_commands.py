@@ -169,14 +169,12 @@ def replay(
     process  Only this process, such as planner-t3.
     until_s  Stop at this time of the run's own clock.
     """
-    from launch_scripts.simulation.replay import other_versions, recordings_of, replay_run, unreadable
+    from launch_scripts.simulation.replay import other_versions, recordings_of, replay_run
 
     logging.getLogger().addHandler(logging.NullHandler())  # what the processes logged is in their own logs
     folder = find_run(run, runs)
-    refused = unreadable(folder, process)
-    others = {
-        name: two for recorded in recordings_of(folder, process) for name, two in other_versions(recorded).items()
-    }
+    recordings, refused = recordings_of(folder, process)
+    others = {name: two for recorded in recordings for name, two in other_versions(recorded).items()}
     if not as_json:
         for package, (then, now) in others.items():
             typer.echo(f"recorded with {package} {then}, replayed with {now}")

@@ -72,7 +72,7 @@ class OwnPart(LatestState):
     def own_alarms(self, now_ns: int) -> list[str]:
         """Returns their alarms, in lines for people."""
         lasting = [alarm for alarm in alarms_of(self, self.plan.targets, now_ns) if alarm.lasts]
-        return lines_of(lasting, self.grid, SHOWN_ALARMS)
+        return lines_of(lasting, SHOWN_ALARMS)
 
     def line(self, title: str, now_ns: int, restarts: int) -> str:
         """All of it in one line."""

@@ -7,7 +7,6 @@ neither colours nor pictures.
 from __future__ import annotations
 
 import io
-import math
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -271,11 +270,7 @@ def _plot(name: str, title: str, legend: bool = True) -> rrb.TimeSeriesView:
 
 
 def _log() -> rrb.TextLogView:
-    columns = [
-        TextLogColumn("EntityPath", visible=False),
-        TextLogColumn("LogLevel", visible=True),
-        TextLogColumn("Body", visible=True),
-    ]
+    columns = [TextLogColumn(name, visible=name != "EntityPath") for name in ("EntityPath", "LogLevel", "Body")]
     return rrb.TextLogView(
         origin="/log",
         name="Log",
@@ -309,15 +304,15 @@ class FiguresPanel:
         lines = [of.get(id) for id in self._target_ids]
         gaps = [None if line is None or line.gap is None else line.gap.mean for line in lines]
         charts: dict[str, Sequence[float | None]] = {
-            "states": [float(n) for n in state.states.values()],
+            "states": [*state.states.values()],
             "captures_and_marks": [state.captures, None if state.marks is None else state.marks / 100],
             "gap": [None if gap is None else (gap - 1) * 100 for gap in gaps],
             "growth_ms": [None if line is None else line.growth_ms for line in lines],
-            "messages": [state.messages_per_s],
+            "messages": [state.messages_now_per_s],
         }
         for chart, values in charts.items():
-            if any(value is not None for value in values):
-                numbers = np.array([math.nan if value is None else value for value in values])
+            numbers = np.array(values, np.float64)  # None becomes NaN
+            if np.isfinite(numbers).any():
                 self._pen.log(f"plots/{chart}", rr.Scalars(numbers))
 
     def summary(self, markdown: str) -> None:

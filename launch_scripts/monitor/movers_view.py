@@ -9,7 +9,6 @@ Few entities with many instances each; of each only changes: see docs/design/liv
 
 from __future__ import annotations
 
-from bisect import bisect_left
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 
@@ -367,7 +366,7 @@ class MoversView:
         self._targets = {line.id for line in summary.targets}
         observed = self._observed
         self._crew = frozenset(observed.plan.crew_now(observed.plan.targets_now(observed.book)))
-        marks = alarm_marks(summary.alarms, summary.elapsed_s, observed.targets(), self._mesh.grid)
+        marks = alarm_marks(summary.alarms, summary.elapsed_s, observed.targets(), self._mesh.grid.resolution_m)
         tops = self._pen.placed(list(marks), _ALARM)
         self._pen.lines("world/alarms/poles", poles(self._mesh, tops))
         self._pen.points("world/alarms/marks", positions=tops, labels=[shown(text, 60) for text in marks.values()])
@@ -466,8 +465,8 @@ class MoversView:
         if self._follow is None:
             return
         place_m = self._observed.targets().get(self._follow)
-        n = bisect_left(vehicles.ids, self._follow)
-        if n < len(vehicles) and vehicles.ids[n] == self._follow:
+        if self._follow in vehicles.ids:
+            n = vehicles.ids.index(self._follow)
             place_m = float(vehicles.east_m[n]), float(vehicles.south_m[n])
         if place_m is not None:
             self._log_followed(place_m)
@@ -519,15 +518,15 @@ def target_labels(
 
 
 def alarm_marks(
-    alarms: Iterable[Alarm], now_s: float, places_m: Mapping[str, Place], grid: GridSpec
+    alarms: Iterable[Alarm], now_s: float, places_m: Mapping[str, Place], resolution_m: float
 ) -> dict[Place, str]:
     """The alarms that are at a place, or about a target that has one: place -> words, one at a place. One that is
     over is seen a little longer."""
     marks: dict[Place, str] = {}
     for alarm in alarms:
         place_m = places_m.get(alarm.target or "")
-        if (cell := alarm.place(grid)) is not None:
-            place_m = (cell[1] + 0.5) * grid.resolution_m, (cell[0] + 0.5) * grid.resolution_m
+        if alarm.row is not None and alarm.col is not None:
+            place_m = (alarm.col + 0.5) * resolution_m, (alarm.row + 0.5) * resolution_m
         seen = alarm.over_s is None or now_s - alarm.over_s <= OVER_S
         if place_m is not None and seen and len(marks) < _MOST_MARKS:
             marks.setdefault(place_m, f"{alarm.label}: {alarm.about}")

@@ -16,8 +16,8 @@
 | run_folders.py     | the folder of a run; the runs of this user on this machine, each by a small file         |
 | palette.py         | how pictures and the live view look                                                      |
 
-A new fact is a field of `RunState` and a row in `FACTS`, which every report has; `LINES` and `IF_ANY` place it in
-the lines for people. Facts are counted by the process that does the counted work, and a restarted process continues
+A new fact is a field of `RunState` with a `Fact`, which every report has; `LINES` and `IF_ANY` place it in the
+lines for people. Facts are counted by the process that does the counted work, and a restarted process continues
 its previous counts (`swarm.runtime.stats.carried`). All watchers therefore agree once messages have arrived,
 whenever they began to watch.
 """

@@ -18,7 +18,6 @@ from dataclasses import asdict, dataclass
 from launch_scripts.observe.latest_messages import LatestState
 from launch_scripts.plain_text import Duration, Moment, plain
 from swarm.clock import NS_PER_S
-from swarm.grid import GridSpec
 from swarm.peers import job_of
 from swarm.wire.messages.processes import Alarm as WireAlarm
 from swarm.wire.topics import POSE, STATS, STATUS, Topic
@@ -65,11 +64,12 @@ class Alarm:
     about       the process, target, author or vehicle that it is about; a process as `planner-t3`
     text        a sentence
     target      the target that it concerns
-    cell        where it is; None if it has no place
+    cell        where it is, as it was told; None if it has no place
     since_s     time of the run at which it began; None if the watcher came later
     over_s      time of the run at which it was over; None while it lasts
     heard_s     time of the run of its last evidence
     began_ns    time when the run began, from which these count; None if it is not known
+    row, col    of the cell; None if it has no place, or names one that is not in the grid, as a tracker may
     is_old      whether the last evidence was over 30 s old when the observer looked
     """
 
@@ -82,6 +82,8 @@ class Alarm:
     target: str | None = None
     heard_s: float | None = None
     began_ns: int | None = None
+    row: int | None = None
+    col: int | None = None
     is_old: bool = False
 
     @property
@@ -118,26 +120,19 @@ class Alarm:
             return f"{Duration(run_s)} of the run"
         return str(Moment(self.began_ns + round(run_s * NS_PER_S)))
 
-    def place(self, grid: GridSpec) -> tuple[int, int] | None:
-        """Row and column; None if it has no place, or names one that is not in the grid, as a tracker may."""
-        if self.cell is None or not 0 <= self.cell < grid.cells:
-            return None
-        return grid.row_col(self.cell)
-
-    def where(self, grid: GridSpec) -> str:
+    @property
+    def where(self) -> str:
         """In words: `row 40, col 200`; empty if it has no place."""
-        place = self.place(grid)
-        return "" if place is None else f"row {place[0]}, col {place[1]}"
+        return "" if self.row is None else f"row {self.row}, col {self.col}"
 
-    def line(self, grid: GridSpec) -> str:
+    @property
+    def line(self) -> str:
         """All of it in one line."""
-        return ", ".join(part for part in (f"{self.label}: {self.text}", self.where(grid), self.when) if part)
+        return ", ".join(part for part in (f"{self.label}: {self.text}", self.where, self.when) if part)
 
-    def fields(self, grid: GridSpec) -> dict[str, object]:
+    def fields(self) -> dict[str, object]:
         """For a report."""
-        row, col = self.place(grid) or (None, None)
-        told = {**asdict(self), "row": row, "col": col}
-        return {name: value for name, value in told.items() if name != "is_old"}
+        return {name: value for name, value in asdict(self).items() if name != "is_old"}
 
 
 def alarms_of(latest: LatestState, targets: Iterable[str], now_ns: int) -> tuple[Alarm, ...]:
@@ -150,6 +145,9 @@ def alarms_of(latest: LatestState, targets: Iterable[str], now_ns: int) -> tuple
     def seconds(stamp_ns: int | None) -> float | None:
         return None if stamp_ns is None else max(stamp_ns - began_ns, 0) / NS_PER_S
 
+    def place(cell: int | None) -> tuple[int | None, int | None]:
+        return (None, None) if cell is None or not 0 <= cell < latest.grid.cells else latest.grid.row_col(cell)
+
     alarms = [
         Alarm(
             plain(told.kind),
@@ -161,6 +159,7 @@ def alarms_of(latest: LatestState, targets: Iterable[str], now_ns: int) -> tuple
             told.target,
             seconds(heard_ns),
             began_ns,
+            *place(told.cell),
             is_old=now_ns - heard_ns > _OLD_NS,
         )
         for told, heard_ns in found

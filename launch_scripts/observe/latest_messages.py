@@ -426,6 +426,10 @@ class LatestState(Counts):
         reports = sorted(self._obstacles.items())
         return {id: each for id, (each, heard_ns) in reports if now_ns - heard_ns < each.lease_s * NS_PER_S}
 
+    def external_seen(self) -> list[str]:
+        """Returns the ids of all external vehicles and other obstacles that ever told their places, in order."""
+        return sorted(self._obstacles)
+
     def goals(self) -> list[GoalState]:
         """Progress of the vehicles that were sent to places, without those that were recalled."""
         return [self._goals[id] for id in sorted(self._goals) if self._goals[id].state != "canceled"]

@@ -193,17 +193,6 @@ class Driven:
         self._newest_rows = np.array([self._rows.get(id, -1) for id in ids], np.intp)
 
 
-def results(latest: LatestState, driven: Driven, scenario: Scenario) -> dict[str, Any]:
-    """`by_target`, `by_group` and `by_vehicle` of the report."""
-    classes = {group.name: group.vehicle_class for group in scenario.groups}
-    by_vehicle = _by_vehicle(latest, driven, scenario, classes)
-    return {
-        "by_target": _by_target(latest, scenario),
-        "by_group": _by_group(latest, by_vehicle, classes),
-        "by_vehicle": by_vehicle,
-    }
-
-
 def _by_target(latest: LatestState, scenario: Scenario) -> dict[str, Any]:
     captures, gaps, vehicles = latest.counts_by(CAPTURES_OF), gaps_to(latest), latest.vehicles()
     return {
@@ -388,7 +377,9 @@ class Recorder:
         _, waiting_s, standing_s = self.driven.totals.sum(axis=1).tolist()
         shown = {
             "t_s": state.elapsed_s,
-            **{name: getattr(state, name) for name in ("captures", "marks", "messages_per_s")},
+            "captures": state.captures,
+            "marks": state.marks,
+            "messages_per_s": state.messages_now_per_s,
             **state.states,
             "growth_ms_mean": _mean(line.growth_ms for line in state.targets),
         }
@@ -411,6 +402,8 @@ class Recorder:
             seconds = (observed.last_ns - observed.first_ns) / NS_PER_S
         # Later messages are those of a run that ends: without trackers there is no alarm.
         state = self.summary(observed.moved_ns or observed.last_ns or 0)
+        classes = {group.name: group.vehicle_class for group in self.scenario.groups}
+        by_vehicle = _by_vehicle(observed, self.driven, self.scenario, classes)
         gap = of_excess(observed.histogram("gap_excess"))  # driven cost over optimum, as the planners measured it
         fields = {
             "scenario": self.scenario.name,
@@ -421,10 +414,11 @@ class Recorder:
             "vehicles": self.scenario.vehicle_count,
             "aloft": [each.name for each in self.scenario.groups if flies(self.scenario, each.vehicle_class)],
             "targets": len(self.scenario.target_ids),
-            "processes": state.well[1],
+            "processes": state.processes_well[1],
             "startup_s": startup_s,
             "vehicles_routed": len(self.routed),
             **for_report(state),
+            "external_seen": observed.external_seen(),
             "tracking": observed.tracking(),
             "stranded": state.states["stranded"] if observed.fleet_ns is not None else None,
             "lost": state.states["lost"] if observed.fleet_ns is not None else None,
@@ -434,7 +428,9 @@ class Recorder:
             "gap": gap if self._gap_max is None else {**gap, "max": self._gap_max},
             **{name: quantiles(observed.histogram(name)) for name in TIMINGS},
             "messages_per_s": _mean(sample.shown["messages_per_s"] for sample in self.samples.all()),
-            **results(observed, self.driven, self.scenario),
+            "by_target": _by_target(observed, self.scenario),
+            "by_group": _by_group(observed, by_vehicle, classes),
+            "by_vehicle": by_vehicle,
         }
         numbers = {name: _rounded(value) for name, value in fields.items()}
         return {"verdict": verdict(numbers, failures), **numbers}

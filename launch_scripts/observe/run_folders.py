@@ -120,11 +120,8 @@ def registered() -> list[KnownRun]:
     runs = []
     for folder, entries in found.items():
         launchers = tuple(entry.pid for entry, is_running in entries if is_running)
-        web_port, is_whole = (
-            max(entry.web_port for entry, _ in entries),
-            any(entry.is_whole for entry, _ in entries),
-        )
-        runs.append(KnownRun(folder, launchers, web_port, is_whole))
+        web_port = max(entry.web_port for entry, _ in entries)
+        runs.append(KnownRun(folder, launchers, web_port, any(entry.is_whole for entry, _ in entries)))
     return sorted(runs, key=lambda run: not run.launchers)
 
 

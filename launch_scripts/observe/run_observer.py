@@ -10,7 +10,7 @@ from __future__ import annotations
 import itertools
 import time
 from collections import Counter, deque
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from typing import Protocol
 
@@ -80,13 +80,13 @@ class Known(Protocol):
 
 
 class RunObserver:
-    """Receives the messages of a run and passes them to `known`. The owner of the bus passes on the events that
-    `post` is given (`take`).
+    """Receives the messages of a run and passes them to `known`, if there is any. The owner of the bus passes on
+    the events that `post` is given (`take`).
 
     topics  topic -> how often the newest of each key is taken, in seconds; 0: all that comes
     """
 
-    def __init__(self, bus: Bus, post: Post, known: Known, topics: Mapping[Topic, float] = HEARD) -> None:
+    def __init__(self, bus: Bus, post: Post, known: Known | None, topics: Mapping[Topic, float] = HEARD) -> None:
         self._bus, self._post = bus, post
         self._known = known
         self._topics = {topic.name: topic for topic in topics}  # by name: a topic is slow to hash
@@ -142,6 +142,8 @@ class RunObserver:
     def take(self, event: Event, now_ns: int) -> None:
         """Takes in one event."""
         match event:
+            case _ if self._known is None:
+                pass
             case Heard(message=message) | Replied(tag="observer-gone", message=message):
                 self._known.heard(message, now_ns)
             case Appeared(peer):
@@ -164,7 +166,7 @@ class OutsideObserver(RunObserver):
         self, bus: Bus, post: Post | None = None, topics: Mapping[Topic, float] = HEARD, *, follows: bool = False
     ) -> None:
         self._inbox = Inbox()
-        super().__init__(bus, post or self._inbox.post, self, topics)
+        super().__init__(bus, post or self._inbox.post, None, topics)
         self.latest: LatestState | None = None
         self.run: RunInfo | None = None
         """The first answer of a process of the run that is observed; None before one is found."""
@@ -174,7 +176,8 @@ class OutsideObserver(RunObserver):
         """True if all processes that reply belong to another run by now; never reset."""
         self.answers: dict[tuple[str, str], RunInfo] = {}
         self._follows = follows
-        self._early: deque[Callable[[LatestState], object]] = deque(maxlen=_EARLY)
+        self._early: deque[tuple[Event, int]] = deque(maxlen=_EARLY)
+        """Events before a run is known, each with its time."""
         self._up: set[Peer] = set()
         self._round: list[RunInfo] = []
         self._ask_due_ns = 0
@@ -210,25 +213,14 @@ class OutsideObserver(RunObserver):
                 self._round, self._asking, self.answered = [], False, True
                 self._ask_due_ns = now_ns + (_ASK_EVERY_NS if self.run is not None else 0)
             case _:
+                if isinstance(event, Appeared):
+                    self._up.add(event.peer)
+                elif isinstance(event, Disappeared):  # it may have ended before it published any counts to us
+                    self._up.discard(event.peer)
+                    self.ask_gone()
+                if self.run is None:
+                    self._early.append((event, now_ns))
                 super().take(event, now_ns)
-
-    def heard(self, message: Message, now_ns: int) -> None:
-        """Takes in a message, also later if the run is not known yet."""
-        self._learn(lambda latest: latest.heard(message, now_ns))
-
-    def alive(self, peer: Peer, up: bool, now_ns: int) -> None:
-        """Handles a change of a liveliness token; the last `Stats` of an ended process are queried, as it may have
-        ended before it published any to us."""
-        (self._up.add if up else self._up.discard)(peer)
-        if not up:
-            self.ask_gone()
-        self._learn(lambda latest: latest.alive(peer, up, now_ns))
-
-    def _learn(self, told: Callable[[LatestState], object]) -> None:
-        if self.run is None:
-            self._early.append(told)
-        if self.latest is not None:
-            told(self.latest)
 
     def members(self) -> tuple[list[RunInfo], list[RunInfo]]:
         """The answers of the processes of the run, routers last, which belong to none; and those of strangers: of
@@ -272,16 +264,16 @@ class OutsideObserver(RunObserver):
         self.answers = {(info.role, info.id): info for info in answers}
         members, _ = self.members()
         frame = frame_of_members(members)
-        latest = LatestState(plan_of_members(members), GridSpec(1, 1, 1.0) if frame is None else frame.grid)
-        for told in self._early:
-            told(latest)
+        grid = GridSpec(1, 1, 1.0) if frame is None else frame.grid
+        latest = self.latest = self._known = LatestState(plan_of_members(members), grid)
+        for event, at_ns in self._early:
+            super().take(event, at_ns)
         if self.run is not None:
             for peer in self._up:
                 latest.alive(peer, True, now_ns)
         if members[0].run_id:
             self.run = members[0]
             self._early.clear()
-        self.latest = latest
 
 
 # --- who takes part, and where ------------------------------------------------------------------------------------

@@ -9,8 +9,8 @@ from __future__ import annotations
 import math
 from collections import Counter
 from collections.abc import Callable, Collection, Hashable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from typing import Any, Generic, TypeVar
+from dataclasses import dataclass, replace
+from typing import Annotated, Any
 
 import numpy as np
 
@@ -19,45 +19,127 @@ from launch_scripts.observe.latest_messages import LatestState, VehicleColumns
 from launch_scripts.observe.summed_counts import CertifiedGap, certified_gap, gap_text, gaps_to, percent
 from launch_scripts.plain_text import Duration, first_of, number_of, plain
 from swarm.clock import NS_PER_S
+from swarm.config.explain import hints_of
 from swarm.config.vehicle_classes import GROUND
-from swarm.grid import GridSpec
 from swarm.runtime.stats import CAPTURES_OF, LEARNED, MESSAGES_PER_S, RESTARTS
 from swarm.wire.messages.orders import GoalState
+
+NONE = "-"
+"""Text for an unknown value."""
+
+
+def count(value: float | None) -> str:
+    """12,345"""
+    return NONE if value is None else f"{value:,.0f}"
+
+
+def seconds(value: float | None) -> str:
+    """34 s, 19 min"""
+    return NONE if value is None else str(Duration(value))
+
+
+def distance(value_m: float | None) -> str:
+    """480 m, 1.2 km"""
+    if value_m is None:
+        return NONE
+    return f"{value_m:.0f} m" if value_m < 999.5 else f"{value_m / 1000:.1f} km"
+
+
+def duration(milliseconds: float | None) -> str:
+    """1.2 ms, 3.4 s"""
+    if milliseconds is None:
+        return NONE
+    return f"{milliseconds:.1f} ms" if milliseconds < 999.95 else f"{milliseconds / 1000:.1f} s"
+
+
+def of_all(value: tuple[int, int]) -> str:
+    """15 of 16"""
+    return f"{value[0]:,} of {value[1]:,}"
+
+
+def each(value: Mapping[str, int]) -> str:
+    """17 following, 1 arrived"""
+    return ", ".join(f"{number:,} {name}" for name, number in value.items() if number) or "none"
+
+
+def factors(value: Mapping[str, float]) -> str:
+    """grass x 2.9, forest x 0.63"""
+    return ", ".join(f"{name} x {factor:.2g}" for name, factor in value.items()) or "nothing"
+
+
+def _mean_gap(value: CertifiedGap | None) -> str:
+    return NONE if value is None else percent(value.mean)
+
+
+def _word(value: str | None) -> str:
+    return NONE if value is None else value
+
+
+@dataclass(frozen=True, slots=True)
+class Fact:
+    """Label and text of a field of a `RunState`, or of a `TargetLine`, of which it is a column.
+
+    label     what people call it
+    text      its value in words; None where it is not known
+    always    whether every table of targets has the column; else `swarm status` alone
+    is_total  it is the count of its name, summed over all processes
+    name      of the field, in the report and for programs
+    """
+
+    label: str
+    text: Callable[[Any], str]
+    always: bool = True
+    is_total: bool = False
+    name: str = ""
+
+    def shown(self, state: RunState | TargetLine) -> str:
+        """The fact in words, as people see it."""
+        return self.text(getattr(state, self.name))
+
+    def labelled(self, state: RunState) -> str:
+        """The same after its label."""
+        return f"{self.label} {self.shown(state)}"
+
+
+def total(label: str) -> Fact:
+    """The fact of a field which is a count, summed over all processes."""
+    return Fact(label, count, is_total=True)
 
 
 @dataclass(frozen=True, slots=True)
 class TargetLine:
-    """One target at an instant. `TARGET_FACTS` selects and formats its fields.
+    """One target at an instant. Columns of its table are `title` and the fields which have a `Fact`, the most
+    important first: a narrow panel cuts off the end.
 
     planner_up  whether its planner or one of its standbys is as it should be
     starting    whether none of them has been seen yet, in the first seconds of a run
     rank        of the planner that leads; 0 unless a standby does
     following   vehicles of the swarm that go for it: where an external vehicle goes is not published
     nearest_m   distance of the nearest vehicle
-    growths     how often its tree was grown or repaired
-    growth_ms   CPU time of the last full search
     captures    how often it was caught
     gap         how far above the optimum the routes to it can be at most
+    growths     how often its tree was grown or repaired
+    growth_ms   CPU time of the last full search
+    strategy    how its tree is kept
     pose_age_s  time since its last pose; None before the first
     lost        whether no tracker publishes it: the position is the last known one
-    strategy    how its tree is kept
     """
 
     id: str
     planner_up: bool
     rank: int
-    following: int
-    nearest_m: float | None
-    growths: int | None
-    growth_ms: float | None
-    captures: int = 0
-    gap: CertifiedGap | None = None
-    pose_age_s: float | None = None
-    lost: bool = False
-    routes_served: int | None = None
-    strategy: str | None = None
-    tracker: str | None = None
-    starting: bool = False
+    following: Annotated[int, Fact("chased by", count)]
+    nearest_m: Annotated[float | None, Fact("nearest", distance)]
+    captures: Annotated[int, Fact("captures", count)]
+    gap: Annotated[CertifiedGap | None, Fact("certified gap", _mean_gap)]
+    growths: Annotated[int | None, Fact("re-plans", count)]
+    growth_ms: Annotated[float | None, Fact("tree", duration)]
+    routes_served: Annotated[int | None, Fact("served", count, always=False)]
+    strategy: Annotated[str | None, Fact("strategy", _word, always=False)]
+    pose_age_s: Annotated[float | None, Fact("seen", seconds, always=False)]
+    tracker: Annotated[str | None, Fact("tracker", _word, always=False)]
+    lost: bool
+    starting: bool
 
     @property
     def title(self) -> str:
@@ -74,68 +156,66 @@ class TargetLine:
 
 @dataclass(frozen=True, slots=True)
 class RunState:
-    """A run at an instant. `FACTS` selects and formats its fields.
+    """A run at an instant. Every report has the fields which have a `Fact`; `LINES`, `IF_ANY` and `MUST_BE_ZERO`
+    place them in the lines for people.
 
-    elapsed_s         time since the run began, start-up included
-    states            vehicles that are driven, by VehicleState
-    classes           the same by class, "ground" first
-    driven            vehicles that an agent drives, and all of the run
-    following         vehicles that have a target
-    captures          how often targets were caught
-    collisions        two vehicles on one cell; must be 0
-    lethal_entries    vehicles on cells that are lethal in truth; must be 0
-    driven_into       vehicles that drove into an obstacle which had said in time where it is; must be 0
-    hit_by_obstacles  the obstacles' own fault
-    reroute_requests  how often a vehicle's own route did not lead it on, so that it asked for another
-    routes_served     routes that planners gave in answer to questions; those which they pushed come on top
-    marks             marks that vehicles made since the last start of their agents
-    messages_per_s    messages that all processes send now
-    payloads_dropped  messages that were none of this swarm, or came under a key that is not their sender's
-    well              processes that are as they should be (alive, or ended because they were asked to), and all
-                      that the run needs
-    ended             of these, processes that ended because they were asked to
-    external          ids of external vehicles and other obstacles which report their places now
-    restarts          how often a process was started again
-    crew              as `well`, by role
-    beside            processes that are alive and not needed: routers, monitors, agents of external vehicles
-    certified_gap     how far above the optimum the routes that vehicles began can be at most, as proven
-    learned           class of ground -> measured factor on its prior pace; only classes whose factor is not 1
-    goals             progress of the vehicles that were sent to places
+    elapsed_s           time since the run began, start-up included
+    vehicles_driven     vehicles that an agent drives, and all of the run
+    states              vehicles that are driven, by VehicleState
+    classes             the same by class, "ground" first
+    following           vehicles that have a target
+    sent                vehicles that were sent to places, by the state of their goals
+    external            ids of external vehicles and other obstacles which report their places now
+    captures            how often targets were caught
+    marks               marks that vehicles made since the last start of their agents
+    reroute_requests    how often a vehicle's own route did not lead it on, so that it asked for another
+    routes_served       routes that planners gave in answer to questions; those which they pushed come on top
+    certified_gap       how far above the optimum the routes that vehicles began can be at most, as proven
+                        (`CertifiedGap.fields`)
+    learned             class of ground -> measured factor on its prior pace; only classes whose factor is not 1
+    collisions          two vehicles on one cell; must be 0
+    lethal_entries      vehicles on cells that are lethal in truth; must be 0
+    driven_into         vehicles that drove into an obstacle which had said in time where it is; must be 0
+    hit_by_obstacles    the obstacles' own fault
+    processes_well      processes that are as they should be (alive, or ended because they were asked to), and all
+                        that the run needs
+    processes_ended     of these, processes that ended because they were asked to
+    restarts            how often a process was started again
+    messages_now_per_s  messages that all processes send now
+    payloads_dropped    messages that were none of this swarm, or came under a key that is not their sender's
+    crew                as `processes_well`, by role
+    beside              processes that are alive and not needed: routers, monitors, agents of external vehicles
+    goals               progress of the vehicles that were sent to places
     """
 
-    elapsed_s: float
-    targets: tuple[TargetLine, ...]
-    states: dict[str, int]
-    classes: dict[str, int]
-    driven: tuple[int, int]
-    following: int
-    captures: int | None
-    collisions: int | None
-    lethal_entries: int | None
-    driven_into: int | None
-    hit_by_obstacles: int | None
-    reroute_requests: int | None
-    routes_served: int | None
-    marks: int | None
-    messages_per_s: float | None
-    payloads_dropped: int | None
-    well: tuple[int, int]
-    ended: int
-    external: tuple[str, ...]
-    restarts: int
+    elapsed_s: Annotated[float, Fact("time", seconds)]
+    vehicles_driven: Annotated[tuple[int, int], Fact("vehicles", of_all)]
+    states: Annotated[dict[str, int], Fact("of these", each)]
+    classes: Annotated[dict[str, int], Fact("classes", each)]
+    following: Annotated[int, Fact("assigned", count)]
+    sent: Annotated[dict[str, int], Fact("sent to places", each)]
+    external: Annotated[tuple[str, ...], Fact("external vehicles", first_of)]
+    captures: Annotated[int | None, total("captures")]
+    marks: Annotated[int | None, total("marks")]
+    reroute_requests: Annotated[int | None, total("re-route requests")]
+    routes_served: Annotated[int | None, total("routes served")]
+    certified_gap: Annotated[dict[str, float | None], Fact("certified gap", gap_text)]
+    learned: Annotated[dict[str, float], Fact("learned", factors)]
+    collisions: Annotated[int | None, total("collisions")]
+    lethal_entries: Annotated[int | None, total("lethal cells entered")]
+    driven_into: Annotated[int | None, total("obstacles driven into")]
+    hit_by_obstacles: Annotated[int | None, total("vehicles hit by obstacles")]
+    processes_well: Annotated[tuple[int, int], Fact("needed processes", of_all)]
+    processes_ended: Annotated[int, Fact("of these ended as asked", count)]
+    restarts: Annotated[int, Fact("restarts", count)]
+    messages_now_per_s: Annotated[float | None, Fact("messages/s", count)]
+    payloads_dropped: Annotated[int | None, total("payloads dropped")]
     crew: dict[str, tuple[int, int]]
     beside: dict[str, int]
-    certified_gap: CertifiedGap
-    learned: dict[str, float]
+    targets: tuple[TargetLine, ...]
     alarms: tuple[Alarm, ...]
     orders: tuple[str, ...]
     goals: tuple[GoalState, ...]
-    grid: GridSpec
-
-    @property
-    def sent(self) -> dict[str, int]:
-        """Vehicles that were sent to places, by the state of their goals."""
-        return dict(Counter(goal.state for goal in self.goals))
 
     @property
     def standing_alarms(self) -> tuple[Alarm, ...]:
@@ -143,16 +223,20 @@ class RunState:
         return tuple(alarm for alarm in self.alarms if alarm.lasts)
 
 
+def _facts_of(state: type) -> tuple[Fact, ...]:
+    """The facts among the fields of a state, in their order."""
+    notes = ((name, getattr(hint, "__metadata__", ())) for name, hint in hints_of(state).items())
+    return tuple(replace(fact, name=name) for name, facts in notes for fact in facts)
+
+
+FACTS, TARGET_FACTS = _facts_of(RunState), (Fact("target", _word, name="title"), *_facts_of(TargetLine))
+fact = {fact.name: fact for fact in FACTS}.__getitem__
+"""A fact of a run by its name. Raises KeyError on a name that is none."""
+
+
 def _by_class(ids: Collection[str], classes: Mapping[str, str]) -> dict[str, int]:
     counts = Counter(classes[id] for id in ids)
     return {name: counts[name] for name in sorted(counts, key=lambda name: (name != GROUND, name))}
-
-
-_TOTALS = (
-    "captures", "collisions", "lethal_entries", "driven_into", "hit_by_obstacles", "reroute_requests",
-    "routes_served", "marks", "payloads_dropped",
-)  # fmt: skip
-"""Fields of a `RunState` which are counts of that name, summed over all processes."""
 
 
 def state_of(latest: LatestState, now_ns: int) -> RunState:
@@ -162,7 +246,7 @@ def state_of(latest: LatestState, now_ns: int) -> RunState:
     needed = set(crew)
     vehicles = latest.driven(needed, now_ns)
     well = [latest.fills(role, id) for role, id in crew]
-    began_ns = latest.began_ns
+    began_ns, goals = latest.began_ns, latest.goals()
     expected, alive = Counter(role for role, _ in crew), Counter[str]()
     for (role, _), is_well in zip(crew, well, strict=True):
         alive[role] += is_well
@@ -171,22 +255,22 @@ def state_of(latest: LatestState, now_ns: int) -> RunState:
         targets=_lines(latest, targets, vehicles, now_ns),
         states=vehicles.count_states(),
         classes=_by_class(vehicles.ids, latest.classes()),
-        driven=(len(vehicles), max(latest.plan.vehicles, len(vehicles))),
+        vehicles_driven=(len(vehicles), max(latest.plan.vehicles, len(vehicles))),
         following=int(np.count_nonzero(vehicles.targets >= 0)),
-        messages_per_s=latest.now_of(MESSAGES_PER_S),
-        well=(sum(well), len(crew)),
-        ended=sum(latest.has_ended(role, id) for role, id in crew),
+        messages_now_per_s=latest.now_of(MESSAGES_PER_S),
+        processes_well=(sum(well), len(crew)),
+        processes_ended=sum(latest.has_ended(role, id) for role, id in crew),
         external=tuple(latest.external(now_ns)),
         restarts=round(latest.gauge(RESTARTS) or 0),
         crew={role: (alive[role], expected[role]) for role in expected},
         beside=dict(Counter(role for role, id in latest.up() if (role, id) not in needed)),
-        certified_gap=certified_gap(latest),
+        certified_gap=certified_gap(latest).fields(),
         learned=_learned(latest),
         alarms=alarms_of(latest, targets, now_ns),
         orders=tuple(map(plain, latest.book.standing)),
-        goals=tuple(latest.goals()),
-        grid=latest.grid,
-        **{name: latest.total(name) for name in _TOTALS},
+        sent=dict(Counter(goal.state for goal in goals)),
+        goals=tuple(goals),
+        **{fact.name: latest.total(fact.name) for fact in FACTS if fact.is_total},
     )
 
 
@@ -235,136 +319,6 @@ def _learned(latest: LatestState) -> dict[str, float]:
     return dict(sorted(max(told, key=len, default={}).items()))
 
 
-NONE = "-"
-"""Text for an unknown value."""
-
-
-Of = TypeVar("Of", RunState, TargetLine)
-
-
-@dataclass(frozen=True, slots=True)
-class Fact(Generic[Of]):
-    """One fact of a run, or of each target: then it is a column.
-
-    name     in the report, and for programs
-    label    what people call it
-    text     its value in words; None where it is not known
-    of       the field that holds it, where that has another name
-    always   whether every table of targets has it; else `swarm status` alone
-    """
-
-    name: str
-    label: str
-    text: Callable[[Any], str]
-    of: str = ""
-    always: bool = True
-
-    def value(self, state: Of) -> Any:
-        """The fact at an instant; None where it is not known."""
-        return getattr(state, self.of or self.name)
-
-    def shown(self, state: Of) -> str:
-        """The fact in words, as people see it."""
-        return self.text(self.value(state))
-
-    def labelled(self, state: Of) -> str:
-        """The same after its label."""
-        return f"{self.label} {self.shown(state)}"
-
-
-def count(value: float | None) -> str:
-    """12,345"""
-    return NONE if value is None else f"{value:,.0f}"
-
-
-def seconds(value: float | None) -> str:
-    """34 s, 19 min"""
-    return NONE if value is None else str(Duration(value))
-
-
-def distance(value_m: float | None) -> str:
-    """480 m, 1.2 km"""
-    if value_m is None:
-        return NONE
-    return f"{value_m:.0f} m" if value_m < 999.5 else f"{value_m / 1000:.1f} km"
-
-
-def duration(milliseconds: float | None) -> str:
-    """1.2 ms, 3.4 s"""
-    if milliseconds is None:
-        return NONE
-    return f"{milliseconds:.1f} ms" if milliseconds < 999.95 else f"{milliseconds / 1000:.1f} s"
-
-
-def of_all(value: tuple[int, int]) -> str:
-    """15 of 16"""
-    return f"{value[0]:,} of {value[1]:,}"
-
-
-def each(value: Mapping[str, int]) -> str:
-    """17 following, 1 arrived"""
-    return ", ".join(f"{number:,} {name}" for name, number in value.items() if number) or "none"
-
-
-def factors(value: Mapping[str, float]) -> str:
-    """grass x 2.9, forest x 0.63"""
-    return ", ".join(f"{name} x {factor:.2g}" for name, factor in value.items()) or "nothing"
-
-
-def _gap(value: CertifiedGap | Mapping[str, float | None]) -> str:
-    return gap_text(value.fields() if isinstance(value, CertifiedGap) else value)
-
-
-def _word(value: str | None) -> str:
-    return NONE if value is None else value
-
-
-FACTS: tuple[Fact[RunState], ...] = (
-    Fact("elapsed_s", "time", seconds),
-    Fact("vehicles_driven", "vehicles", of_all, of="driven"),
-    Fact("states", "of these", each),
-    Fact("classes", "classes", each),
-    Fact("following", "assigned", count),
-    Fact("sent", "sent to places", each),
-    Fact("external", "external vehicles", first_of),
-    Fact("captures", "captures", count),
-    Fact("marks", "marks", count),
-    Fact("reroute_requests", "re-route requests", count),
-    Fact("routes_served", "routes served", count),
-    Fact("certified_gap", "certified gap", _gap),
-    Fact("learned", "learned", factors),
-    Fact("collisions", "collisions", count),
-    Fact("lethal_entries", "lethal cells entered", count),
-    Fact("driven_into", "obstacles driven into", count),
-    Fact("hit_by_obstacles", "vehicles hit by obstacles", count),
-    Fact("processes_well", "needed processes", of_all, of="well"),
-    Fact("processes_ended", "of these ended as asked", count, of="ended"),
-    Fact("restarts", "restarts", count),
-    Fact("messages_now_per_s", "messages/s", count, of="messages_per_s"),
-    Fact("payloads_dropped", "payloads dropped", count),
-)
-"""Facts of a run, which every report has; `LINES`, `IF_ANY` and `MUST_BE_ZERO` place them in the lines for people.
-The docstring of `RunState` says what each means."""
-
-TARGET_FACTS: tuple[Fact[TargetLine], ...] = (
-    Fact("target", "target", _word, of="title"),
-    Fact("chased_by", "chased by", count, of="following"),
-    Fact("nearest_m", "nearest", distance),
-    Fact("captures", "captures", count),
-    Fact("certified_gap", "certified gap", lambda gap: NONE if gap is None else percent(gap.mean), of="gap"),
-    Fact("re_plans", "re-plans", count, of="growths"),
-    Fact("growth_ms", "tree", duration),
-    Fact("routes_served", "served", count, always=False),
-    Fact("strategy", "strategy", _word, always=False),
-    Fact("pose_age_s", "seen", seconds, always=False),
-    Fact("tracker", "tracker", _word, always=False),
-)
-"""Facts on show of each target, the most important first: a narrow panel cuts off the end."""
-
-fact = {fact.name: fact for fact in FACTS}.__getitem__
-"""A fact of the table by its name. Raises KeyError on a name that is none."""
-
-
 def table(state: RunState, *, always: bool = True) -> tuple[list[str], list[list[str]]]:
     """The labels of the columns that every table of targets has, or of the target and the others; and the rows."""
     columns = [column for column in TARGET_FACTS if column.always == always or column is TARGET_FACTS[0]]
@@ -390,8 +344,8 @@ def lines(state: RunState) -> list[str]:
     found = ["  ".join(fact(name).labelled(state) for name in names) for names in LINES]
     if list(state.classes) not in ([], [GROUND]):
         found.insert(1, fact("classes").labelled(state))
-    found += [fact(name).labelled(state) for name in IF_ANY if fact(name).value(state)]
-    if wrong := [fact(name).labelled(state) for name in MUST_BE_ZERO if fact(name).value(state)]:
+    found += [fact(name).labelled(state) for name in IF_ANY if getattr(state, name)]
+    if wrong := [fact(name).labelled(state) for name in MUST_BE_ZERO if getattr(state, name)]:
         found.append("  ".join(wrong))
     return found
 
@@ -405,27 +359,25 @@ def alarm_lines(state: RunState, most: int, *, over: bool = False) -> list[str]:
 
     over  also closed alarms
     """
-    return lines_of(state.alarms if over else state.standing_alarms, state.grid, most)
+    return lines_of(state.alarms if over else state.standing_alarms, most)
 
 
-def lines_of(alarms: Iterable[Alarm], grid: GridSpec, most: int) -> list[str]:
+def lines_of(alarms: Iterable[Alarm], most: int) -> list[str]:
     """Alarms in lines for people, and how many lines are left out."""
-    found = [line for line, _ in grouped(alarms, grid)]
+    found = [line for line, _ in grouped(alarms)]
     return [*found[:most], f"... {len(found) - most} more"] if len(found) > most else found
 
 
-def grouped(alarms: Iterable[Alarm], grid: GridSpec) -> list[tuple[str, list[str]]]:
+def grouped(alarms: Iterable[Alarm]) -> list[tuple[str, list[str]]]:
     """Lines for people, and the lines that each sums up. Many alarms of a kind, all over or all not, are in one
     line; among its own lines, many alarms of one process are in one, too."""
     return [
-        (line, [own for own, _ in _summed(of_kind, lambda alarm: alarm.about, grid)] if len(of_kind) > 1 else [])
-        for line, of_kind in _summed(alarms, lambda alarm: (alarm.kind, alarm.lasts), grid)
+        (line, [own for own, _ in _summed(of_kind, lambda alarm: alarm.about)] if len(of_kind) > 1 else [])
+        for line, of_kind in _summed(alarms, lambda alarm: (alarm.kind, alarm.lasts))
     ]
 
 
-def _summed(
-    alarms: Iterable[Alarm], key: Callable[[Alarm], Hashable], grid: GridSpec
-) -> Iterator[tuple[str, list[Alarm]]]:
+def _summed(alarms: Iterable[Alarm], key: Callable[[Alarm], Hashable]) -> Iterator[tuple[str, list[Alarm]]]:
     """Returns lines and the alarms of each: many alarms of one key are in one line."""
     keys: dict[Hashable, list[Alarm]] = {}
     for alarm in alarms:
@@ -434,7 +386,7 @@ def _summed(
         if len(some) > _SAID_SINGLY:
             yield together(some), some
         else:
-            yield from ((each.line(grid), [each]) for each in some)
+            yield from ((each.line, [each]) for each in some)
 
 
 def together(alarms: Sequence[Alarm]) -> str:
@@ -449,9 +401,8 @@ def together(alarms: Sequence[Alarm]) -> str:
 def for_report(state: RunState) -> dict[str, Any]:
     """Every fact by its name, for a report, and every alarm."""
     return {
-        **{each.name: each.value(state) for each in FACTS},
-        "certified_gap": state.certified_gap.fields(),
-        "alarms": [alarm.fields(state.grid) for alarm in state.alarms],
+        **{each.name: getattr(state, each.name) for each in FACTS},
+        "alarms": [alarm.fields() for alarm in state.alarms],
     }
 
 

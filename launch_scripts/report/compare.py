@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from launch_scripts.observe.summed_counts import percent
+from launch_scripts.observe.summed_counts import percent, sum_of
 
 _WHERE_ONLY = ("network.listen", "network.connect", "monitor.web_port")
 """Keys that say where a run was met, not what ran: free ports differ each time."""
@@ -106,5 +106,4 @@ def _table(value: Any) -> Mapping[str, Any]:
 
 
 def _sum(groups: Mapping[str, Any], name: str) -> float | None:
-    numbers = [value for row in groups.values() if isinstance(value := _table(row).get(name), int | float)]
-    return sum(numbers) if numbers else None
+    return sum_of(value for row in groups.values() if isinstance(value := _table(row).get(name), int | float))

@@ -81,20 +81,19 @@ def write_report(
     report = {**report, **({"made": made} if (made := ended(folder)) else {})}
     from launch_scripts.report import run_page_and_map as pages  # matplotlib takes a moment
 
-    tracks, factors = packed_tracks(recorder), factors_in(recorder.observed.learned_words())
+    factors = factors_in(recorder.observed.learned_words())
     ground = pages.ground_picture(terrain, recorder.scenario, truth)
     report = {**report, "ground_shows": ground.drawn}
     write_file(folder / REPORT_FILE, json.dumps(report, indent=1, allow_nan=False).encode() + b"\n")
     for section, (file, _) in TABLES.items():
         write_file(folder / file, csv_of(section, report))
-    write_file(folder / TRACKS_FILE, tracks)
+    write_file(folder / TRACKS_FILE, packed_tracks(recorder))
     write_file(folder / pages.GROUND_FILE, image_bytes(ground.pixels, "WEBP"))
     write_file(folder / GROUND_PACE_FILE, packed_ground(terrain, ground.level))
     if (factors != 1).any():
         pixels = pages.learned_pixels(terrain, factors)
         write_file(folder / pages.LEARNED_FILE, image_bytes(pixels, "PNG"))
-    shown = tracks_in(tracks, folder / TRACKS_FILE)
-    pages.save_picture(folder / PICTURE_FILE, ground, shown, report)
+    pages.save_picture(folder / PICTURE_FILE, ground, read_tracks(folder / TRACKS_FILE), report)
     pages.write_page(folder)
 
 
@@ -291,9 +290,10 @@ def _shaped(values: Any, kind: str) -> NDArray[Any]:
 
 
 @contextlib.contextmanager
-def _arrays_in(content: bytes, path: Path) -> Iterator[Any]:
+def _arrays_in(path: Path, kind: FileKind) -> Iterator[Any]:
     """The arrays of an archive, by name. Raises StoreError if it is damaged, also if the reader raises ValueError
-    on what they hold; `path` is how the sentence calls the file."""
+    on what they hold."""
+    content = read_bytes(path, kind)
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
             unpacked = sum(each.file_size for each in archive.infolist())
@@ -310,7 +310,7 @@ def read_ground(folder: Path, grid: GridSpec) -> GroundPace | None:
     path = folder / GROUND_PACE_FILE
     if not path.exists():
         return None
-    with _arrays_in(read_bytes(path, FileKind.RUN), path) as arrays:
+    with _arrays_in(path, FileKind.RUN) as arrays:
         side, best_s_per_m = int(arrays["side"]), float(arrays["best_s_per_m"])
         pace = arrays["pace_s_per_m"].astype(np.float16)
         if side < 1 or pace.shape != (-(-grid.rows // side), -(-grid.cols // side)):
@@ -324,13 +324,7 @@ def read_ground(folder: Path, grid: GridSpec) -> GroundPace | None:
 
 def read_tracks(path: Path) -> RunTracks:
     """The tracks that a run left. Raises StoreError in one sentence if there are none, or damaged ones."""
-    return tracks_in(read_bytes(path, FileKind.TRACKS), path)
-
-
-def tracks_in(content: bytes, path: Path) -> RunTracks:
-    """Reads the output of `packed_tracks`. Raises StoreError if it is damaged; `path` is how the sentence calls
-    it."""
-    with _arrays_in(content, path) as arrays:
+    with _arrays_in(path, FileKind.TRACKS) as arrays:
         grid = _grid(str(arrays["grid"]))
         columns = {name: _checked(name, arrays[name], kind) for name, (_, kind) in _COLUMNS.items()}
         rows: dict[str, int] = {}

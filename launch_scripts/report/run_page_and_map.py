@@ -411,13 +411,11 @@ def page_of(folder: Path, report: Mapping[str, Any]) -> str:
 
 def _alarms(report: Mapping[str, Any]) -> list[tuple[str, bool, list[str]]]:
     """Returns the alarms, the serious first: a line, whether it is serious, and the lines that it summarises."""
-    size = report.get("terrain") or {}
-    grid = GridSpec(size.get("rows", 1), size.get("cols", 1), 1.0)
     told = msgspec.convert(report.get("alarms") or [], list[Alarm])
     return [
         (line, serious, parts)
         for serious in (True, False)
-        for line, parts in grouped((each for each in told if each.serious == serious), grid)
+        for line, parts in grouped(each for each in told if each.serious == serious)
     ]
 
 

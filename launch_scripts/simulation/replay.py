@@ -83,10 +83,18 @@ class Replayed(NamedTuple):
         return self.outcome is not None and self.outcome.difference is None and self.outcome.damaged is None
 
 
-def recordings_of(folder: Path, process: str | None = None) -> list[Recorded]:
-    """The recordings in a run's folder, in the order of roles and ids, but for those that `unreadable` says. Raises
-    ConfigError if there is none, and StoreError if none of them can be read."""
-    found, refused = _heads(folder)
+def recordings_of(folder: Path, process: str | None = None) -> tuple[list[Recorded], list[str]]:
+    """The recordings in a run's folder, in the order of roles and ids, and a sentence for each file that is none
+    from its first record on, as where a disk was full when the process began. Raises ConfigError if there is none,
+    and StoreError if none of them can be read."""
+    found: list[tuple[Head, Path]] = []
+    refused: list[tuple[Path, str]] = []
+    for path in sorted((folder / FOLDER).glob(f"*{SUFFIX}")):
+        try:
+            with RecordReader(path) as reader:
+                found.append((reader.head, path))
+        except StoreError as error:
+            refused.append((path, str(error)))
     if refused and not found:
         raise StoreError(refused[0][1])
     if not found:
@@ -109,32 +117,13 @@ def recordings_of(folder: Path, process: str | None = None) -> list[Recorded]:
     if not some:
         there = ", ".join(dict.fromkeys(each.process for each in recorded))
         raise ConfigError(f"no process {process!r} is recorded in {folder}; there are {there}")
-    return some
-
-
-def unreadable(folder: Path, process: str | None = None) -> list[str]:
-    """A sentence for each file in a run's folder that is no recording from its first record on, as where a disk was
-    full when the process began."""
-    return [why for path, why in _heads(folder)[1] if process is None or path.name.startswith(f"{process}.")]
-
-
-def _heads(folder: Path) -> tuple[list[tuple[Head, Path]], list[tuple[Path, str]]]:
-    """Recordings with their heads; files that have none, and why."""
-    found: list[tuple[Head, Path]] = []
-    refused: list[tuple[Path, str]] = []
-    for path in sorted((folder / FOLDER).glob(f"*{SUFFIX}")):
-        try:
-            with RecordReader(path) as reader:
-                found.append((reader.head, path))
-        except StoreError as error:
-            refused.append((path, str(error)))
-    return found, refused
+    return some, [why for path, why in refused if process is None or path.name.startswith(f"{process}.")]
 
 
 def replay_run(folder: Path, process: str | None = None, until_s: float | None = None) -> Iterator[Replayed]:
     """Feeds the recordings of a run to the services of this build, each in turn. Raises as `recordings_of`."""
     grounds: dict[str, tuple[Terrain, Floats]] = {}
-    for recorded in recordings_of(folder, process):
+    for recorded in recordings_of(folder, process)[0]:
         outcome, why = None, None
         try:
             outcome = _outcome(recorded, folder, grounds, until_s)

@@ -15,6 +15,13 @@ from swarm.wire.messages.vehicles import VehicleState
 SECONDS = 24.0
 
 
+def flows(scenario, terrain, plan):
+    """Every law holds in a crowd, and it does its work."""
+    simulation = Simulation(scenario, faults=plan, terrain=terrain)
+    assert LawBook(simulation).run(SECONDS) == []
+    assert simulation.report(SECONDS)["captures"] > 5
+
+
 @pytest.mark.parametrize(
     "kind", [kind if kind == "maze" else pytest.param(kind, marks=pytest.mark.thorough) for kind in CROWDS]
 )
@@ -22,9 +29,7 @@ def test_eight_agents_in_a_crowd_with_every_fault_at_once(kind):
     scenario, terrain = crowd(kind, 1, vehicles=56, per_agent=7, side=22)
     plan = random_plan(scenario, 1, SECONDS)
     assert plan.crashes and plan.partitions and plan.hangs  # noqa: PT018
-    simulation = Simulation(scenario, faults=plan, terrain=terrain)
-    assert LawBook(simulation).run(SECONDS) == []
-    assert simulation.report(SECONDS)["captures"] > 5
+    flows(scenario, terrain, plan)
 
 
 @pytest.mark.seeds(1)
@@ -32,9 +37,7 @@ def test_a_crowd_with_certificates_and_every_fault_flows(seed):
     scenario, terrain = crowd("open", seed, vehicles=30, per_agent=5, side=16)
     tls = TlsConfig(ca="ca.pem", certificate="certs", key="certs")
     scenario = replace(scenario, network=replace(scenario.network, tls=tls))
-    simulation = Simulation(scenario, faults=random_plan(scenario, seed, SECONDS), terrain=terrain)
-    assert LawBook(simulation).run(SECONDS) == []
-    assert simulation.report(SECONDS)["captures"] > 5
+    flows(scenario, terrain, random_plan(scenario, seed, SECONDS))
 
 
 @pytest.mark.seeds(4)

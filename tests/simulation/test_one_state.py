@@ -260,20 +260,15 @@ def test_no_fact_shown_in_two_places_differs(scenario: Scenario, plan: Callable[
                 continue
             assert fact.text(report[fact.name]) == shown["table"].get(fact.label, fact.shown(state)), (place, fact)
     assert rows_in(texts["view"]) == rows_in(texts["table"]) == rows_in(texts["status"])
-    lasting = [alarm.line(state.grid) for alarm in state.standing_alarms]
+    lasting = [alarm.line for alarm in state.standing_alarms]
     alarms = {place: {line for line in lasting if line in text} for place, text in texts.items()}
-    assert (
-        alarms["view"]
-        == alarms["table"]
-        == alarms["status"]
-        == {alarm.line(state.grid) for alarm in state.standing_alarms}
-    )
+    assert alarms["view"] == alarms["table"] == alarms["status"] == set(lasting)
     told = [(each["kind"], each["about"], each["over_s"]) for each in values["report"]["alarms"]]
     assert told == [(each["kind"], each["about"], each["over_s"]) for each in values["status as JSON"]["alarms"]]
 
     vehicles = watched.logged.details("world/vehicles")
     does = {name: sum(f": {name}" in text for text in vehicles) for name in state.states}
-    assert len(vehicles) == state.driven[0]
+    assert len(vehicles) == state.vehicles_driven[0]
     assert does == state.states
 
     # The end: what the recording shows last is what the report says.

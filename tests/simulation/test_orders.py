@@ -34,10 +34,22 @@ def target_cells(simulation: OrderedSimulation) -> dict[str, int]:
     return {id: target.walker.cell for id, target in service._world._targets.items()}
 
 
-def test_a_pause_stops_everything_and_a_resume_lets_it_go_on(terrain: Terrain) -> None:
+@pytest.mark.parametrize(
+    ("halt", "go_on"),
+    [
+        (PAUSE, RESUME),
+        (
+            GiveOrder(subject="set", name="time_scale", value=0.001),
+            GiveOrder(subject="set", name="time_scale", off=True),
+        ),
+    ],
+)
+def test_a_pause_or_a_time_that_hardly_passes_stops_everything_until_it_is_taken_back(
+    halt: GiveOrder, go_on: GiveOrder, terrain: Terrain
+) -> None:
     simulation = simulated(terrain)
-    simulation.order(6.0, PAUSE)
-    simulation.order(12.0, RESUME)
+    simulation.order(6.0, halt)
+    simulation.order(12.0, go_on)
     simulation.run_until(9.0)  # a step over slow ground, once begun, takes two seconds
     stood, targets = cells(simulation), target_cells(simulation)
     simulation.run_until(11.9)
@@ -102,18 +114,6 @@ def test_a_target_is_put_somewhere_else_and_stays_there_when_its_process_starts_
     simulation.crash("targets-0")
     simulation.run_until(16.0)
     assert target_cells(simulation)["t1"] == cell
-
-
-def test_settings_change_while_the_swarm_runs(terrain: Terrain) -> None:
-    simulation = simulated(terrain)
-    simulation.order(4.0, GiveOrder(subject="set", name="time_scale", value=0.001))
-    simulation.run_until(6.0)
-    before = cells(simulation)
-    simulation.run_until(9.0)
-    assert cells(simulation) == before
-    simulation.order(9.0, GiveOrder(subject="set", name="time_scale", off=True))
-    simulation.run_until(13.0)
-    assert cells(simulation) != before
 
 
 def test_who_takes_a_zone_for_over_as_its_clock_is_wrong_does_not_say_that_it_obeys(terrain: Terrain) -> None:

@@ -55,14 +55,15 @@ def test_a_run_is_the_same_byte_for_byte_whatever_the_hash_seed_is(seed, tmp_pat
     assert reports[0] == reports[1]
 
 
-def test_watching_a_run_does_not_change_it():
-    trace = io.StringIO()
-    plan = random_plan(SMALL, 3, 4)
-    one = simulate(seeded(3), seconds=4, faults=plan, trace=trace)
-    other = simulate(seeded(3), seconds=4, faults=plan)
-    assert one == other
-    assert trace.getvalue().splitlines()[0].startswith("0.")
-    assert one["deliveries"] == sum(" > " in line for line in trace.getvalue().splitlines())
+def test_neither_watching_nor_recording_a_run_changes_it(tmp_path):
+    plan, watched, recorded = random_plan(SMALL, 3, 4), io.StringIO(), io.StringIO()
+    one = simulate(seeded(3), seconds=4, faults=plan, trace=watched)
+    simulate(seeded(3), seconds=4, faults=plan, trace=recorded, record_to=tmp_path)
+    assert one == simulate(seeded(3), seconds=4, faults=plan)
+    lines = watched.getvalue().splitlines()
+    assert lines == recorded.getvalue().splitlines()
+    assert lines[0].startswith("0.")
+    assert one["deliveries"] == sum(" > " in line for line in lines)
 
 
 def result_of(seed: int, name: str = "small", given: Scenario | None = None) -> Result:

@@ -13,7 +13,7 @@ from launch_scripts.simulation.simulate import Node, Simulation
 from vehicle_agent.service import AgentService
 
 
-def drive(delay_ms: float, until_s: float, jitter_ms: float = 0.0) -> tuple[Simulation, LawBook, int]:
+def drive(delay_ms: float, until_s: float, jitter_ms: float) -> tuple[Simulation, LawBook, int]:
     """Returns the simulation, its laws and the steps of all vehicles from the eighth second on."""
     scenario, terrain = world("small", 3)
     simulation = Simulation(scenario, faults=FaultPlan(delay_ms=delay_ms, jitter_ms=jitter_ms), terrain=terrain)
@@ -28,33 +28,26 @@ def drive(delay_ms: float, until_s: float, jitter_ms: float = 0.0) -> tuple[Simu
     return simulation, laws, entered
 
 
-@pytest.mark.parametrize("delay_ms", [200.0, 600.0, pytest.param(400.0, marks=pytest.mark.thorough)])
-def test_a_swarm_whose_messages_are_all_late_drives_and_says_so(delay_ms: float) -> None:
-    simulation, laws, entered = drive(delay_ms, 20.0)
-    assert entered >= 22  # without delay they enter 220
+@pytest.mark.parametrize(
+    ("delay_ms", "jitter_ms", "until_s", "least", "is_slow"),
+    [
+        (50.0, 0.0, 10.0, 1, False),
+        (200.0, 0.0, 20.0, 22, True),  # without delay they enter 220
+        pytest.param(400.0, 0.0, 20.0, 22, True, marks=pytest.mark.thorough),
+        (600.0, 0.0, 20.0, 22, True),
+        (1000.0, 0.0, 28.0, 1, None),
+        pytest.param(150.0, 450.0, 20.0, 21, None, marks=pytest.mark.thorough),
+    ],
+)
+def test_a_swarm_whose_messages_are_all_late_drives_and_says_so_where_they_are_slow(
+    delay_ms: float, jitter_ms: float, until_s: float, least: int, is_slow: bool | None
+) -> None:
+    simulation, laws, entered = drive(delay_ms, until_s, jitter_ms)
+    assert entered >= least
     assert laws.collisions == laws.lethal == []
-    notes = [note for _, note in simulation.recorder.notes if note.kind == "slow_link"]
-    assert notes
-    assert "answers slowly" in notes[0].text
-
-
-def test_with_a_second_each_way_vehicles_still_drive_and_none_meet() -> None:
-    _, laws, entered = drive(1000.0, 28.0)
-    assert entered > 0
-    assert laws.collisions == laws.lethal == []
-
-
-@pytest.mark.thorough
-def test_delays_that_vary_by_as_much_as_they_last_do_not_stop_a_swarm() -> None:
-    _, laws, entered = drive(150.0, 20.0, jitter_ms=450.0)
-    assert entered > 20
-    assert laws.collisions == laws.lethal == []
-
-
-def test_on_a_fast_link_it_is_not_said_that_a_link_is_slow() -> None:
-    simulation, _, entered = drive(50.0, 10.0)
-    assert entered > 0
-    assert not [note for _, note in simulation.recorder.notes if note.kind == "slow_link"]
+    notes = [note.text for _, note in simulation.recorder.notes if note.kind == "slow_link"]
+    assert is_slow in (None, bool(notes))
+    assert all("answers slowly" in text for text in notes)
 
 
 SECONDS = 12.0

@@ -132,10 +132,10 @@ def receivers(simulation: Simulation) -> dict[str, Tracking | None]:
 
 
 def owners(simulation: Simulation) -> set[str | None]:
-    now_ns = EPOCH_NS + int(simulation.now_s * NS_PER_S)
     everybody = receivers(simulation)
     assert len(everybody) == 6  # the recorder, a planner, three agents, the referee
-    return {None if each is None or each.lost(now_ns) else each.pose.tracker for each in everybody.values()}  # type: ignore[union-attr]
+    lost = {name for name, each in everybody.items() if each is None or each.lost(simulation.now_ns)}
+    return {None if name in lost else each.pose.tracker for name, each in everybody.items()}  # type: ignore[union-attr]
 
 
 def captures_of_x(simulation: Simulation) -> int:
@@ -169,7 +169,7 @@ def test_a_dead_tracker_s_target_is_served_with_its_age_and_its_chasers_know(clo
     assert reply.target_cell == simulation.terrain.grid.cell(20, simulation.terrain.grid.cols // 2)
     assert states(simulation) == {VehicleState.OUTDATED}
     assert ear.status.tracker_lost
-    line = next(each for each in simulation.recorder.summary(_now_ns(simulation)).targets if each.id == "x")
+    line = next(each for each in simulation.recorder.summary(simulation.now_ns).targets if each.id == "x")
     assert line.lost
     assert line.pose_age_s == pytest.approx(simulation.now_s - 12, abs=0.8)
     assert line.title == f"x (lost for {line.pose_age_s:.0f} s)"
@@ -202,7 +202,7 @@ def test_a_target_whose_tracker_stays_lost_is_searched_for_until_it_or_a_vehicle
     assert reply.tracker_lost
     assert VehicleState.SEARCHING in states(simulation)
     assert VehicleState.OUTDATED not in states(simulation)
-    now_ns, grid = EPOCH_NS + int(simulation.now_s * NS_PER_S), simulation.terrain.grid
+    now_ns, grid = simulation.now_ns, simulation.terrain.grid
     cell = grid.cell(24, grid.cols // 2)
     x_m, y_m = grid.centre_m(cell)
     seen = Sighted(
@@ -249,12 +249,8 @@ def test_a_receiver_that_starts_while_two_trackers_tell_follows_the_same_as_all_
 def test_the_poses_of_simulated_targets_age_the_same_way_when_their_process_is_killed() -> None:
     simulation = Simulation(seeded(1), faults=FaultPlan(crashes=(Crash(10, "targets-0", for_good=True),)))
     simulation.run_until(15)
-    summary = simulation.recorder.summary(_now_ns(simulation))
+    summary = simulation.recorder.summary(simulation.now_ns)
     assert [line.lost for line in summary.targets] == [True, True]
     assert summary.states["outdated"] == 10
     simulation.finish()
     assert simulation.report(15)["tracking"]["lost_at_end"] == ["t0", "t1"]
-
-
-def _now_ns(simulation: Simulation) -> int:
-    return EPOCH_NS + int(simulation.now_s * NS_PER_S)

@@ -25,16 +25,8 @@ ABOVE_HOME, ABOVE_TERRAIN = 6, 11
 """Frames of latitudes and longitudes times 1e7: GLOBAL_RELATIVE_ALT_INT and GLOBAL_TERRAIN_ALT_INT."""
 ACCEPTED, IN_PROGRESS = 0, 5
 """MAV_RESULT."""
-_INVALID_AUTOPILOT = 8
+_NO_AUTOPILOT = common.MAV_AUTOPILOT_INVALID
 """MAV_AUTOPILOT of what flies nothing, such as a camera."""
-_ONBOARD_CONTROLLER, _ACTIVE = 18, 4
-"""MAV_TYPE and MAV_STATE of our heartbeat."""
-_ARMED = 128
-"""MAV_MODE_FLAG_SAFETY_ARMED."""
-_WARNING = 4
-"""MAV_SEVERITY."""
-_CANCELLED = 15
-"""MAV_MISSION_OPERATION_CANCELLED."""
 _POSITION_ONLY, _PLACE_ONLY = 0x0DF8, 0x0DFC
 """Type masks of a setpoint: the fields that are ignored. The second ignores the height, too."""
 _NOT_KNOWN = 65535
@@ -210,7 +202,7 @@ class Wire:
         if message.get_srcComponent() != AUTOPILOT or sysid in (0, SYSID):
             return False
         beats = message.get_type() == "HEARTBEAT"
-        if self.vehicle is None and beats and message.autopilot != _INVALID_AUTOPILOT:
+        if self.vehicle is None and beats and message.autopilot != _NO_AUTOPILOT:
             self.vehicle = sysid
         return bool(sysid == self.vehicle)
 
@@ -218,7 +210,7 @@ class Wire:
         """Returns a message to the vehicle as bytes; none while no vehicle is known, except for a heartbeat."""
         mav, to = self._mav, (self.vehicle, AUTOPILOT)
         if isinstance(message, Heartbeat):
-            mav.heartbeat_send(_ONBOARD_CONTROLLER, _INVALID_AUTOPILOT, 0, 0, _ACTIVE)
+            mav.heartbeat_send(common.MAV_TYPE_ONBOARD_CONTROLLER, _NO_AUTOPILOT, 0, 0, common.MAV_STATE_ACTIVE)
         elif self.vehicle is None:
             return b""
         match message:
@@ -233,7 +225,7 @@ class Wire:
             case MissionCurrent(seq=seq):
                 mav.mission_set_current_send(*to, seq)
             case MissionCancelled():
-                mav.mission_ack_send(*to, _CANCELLED)
+                mav.mission_ack_send(*to, common.MAV_MISSION_OPERATION_CANCELLED)
             case Setpoint(frame=frame, height_m=height_m):
                 mask = _PLACE_ONLY if height_m is None else _POSITION_ONLY
                 where = *_degrees7(message), height_m or 0.0
@@ -248,8 +240,9 @@ def _degrees7(place: MissionItem | Setpoint) -> tuple[int, int]:
 def _read(message: Any) -> Incoming | None:
     """Returns a message as the core has it; None of what makes no sense, is not to us, or is not heard."""
     match message.get_type():
-        case "HEARTBEAT" if message.autopilot != _INVALID_AUTOPILOT:
-            return Beat(message.autopilot, message.type, bool(message.base_mode & _ARMED), message.custom_mode)
+        case "HEARTBEAT" if message.autopilot != _NO_AUTOPILOT:
+            armed = bool(message.base_mode & common.MAV_MODE_FLAG_SAFETY_ARMED)
+            return Beat(message.autopilot, message.type, armed, message.custom_mode)
         case "GLOBAL_POSITION_INT":
             return _position(message)
         case "MISSION_REQUEST_INT" | "MISSION_REQUEST" if _is_of_our_mission(message):
@@ -258,7 +251,7 @@ def _read(message: Any) -> Incoming | None:
             return MissionAnswered(message.type)
         case "COMMAND_ACK" if message.target_system in (0, SYSID):
             return CommandAnswered(message.command, message.result)
-        case "STATUSTEXT" if message.severity <= _WARNING:
+        case "STATUSTEXT" if message.severity <= common.MAV_SEVERITY_WARNING:
             text = message.text if isinstance(message.text, str) else message.text.decode("ascii", "replace")
             shown = "".join(letter for letter in text if " " <= letter <= "~").strip()
             return Warned(shown) if shown else None

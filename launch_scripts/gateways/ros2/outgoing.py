@@ -262,11 +262,8 @@ class Gateway:
             self._say(f"{who} is not published to ROS: {why}")
 
     def _channels_now(self) -> frozenset[Channel]:
-        names: dict[str | None, Iterable[str | None]] = {
-            None: (None,),
-            VEHICLE: self._vehicles,
-            TARGET: self._targets,
-        }
+        names: dict[str | None, Iterable[str | None]]
+        names = {None: (None,), VEHICLE: self._vehicles, TARGET: self._targets}
         return frozenset(self._channel(row.name, of) for row in self._rows.values() for of in names[row.per])
 
     def _channel(self, row: str, name: str | None = None) -> Channel:
@@ -311,8 +308,7 @@ class Gateway:
         points_m = np.array([each.place[:2] for each in told], np.float64).reshape(-1, 2)
         yield None, self._messages.pose_array(now.stamp_ns, points_m, [each.place[2] for each in told])
 
-    # --- targets. An untracked target may be anywhere: it is published again when a tracker returns
-    # -------------------------
+    # --- targets. An untracked target may be anywhere: it is published again when a tracker returns ---------------
 
     def _tracked(self, now: _Now) -> dict[str, SeenTarget]:
         """By name in ROS."""

@@ -140,14 +140,14 @@ def headings_along(points_m: NDArray[np.float64]) -> list[float]:
 
     points_m  float64 (n, 2): x to the east, y to the north
     """
-    headings: list[float] = []
-    steps = np.diff(points_m, axis=0).tolist()
-    moving = [math.atan2(east_m, north_m) % math.tau for east_m, north_m in steps if east_m or north_m]
-    at = -1
-    for east_m, north_m in steps:
-        at += bool(east_m or north_m)
-        headings.append(moving[max(at, 0)] if moving else 0.0)
-    return (headings + (headings[-1:] or [0.0]))[: len(points_m)]
+    steps = np.diff(points_m, axis=0)
+    moves = steps.any(axis=1)
+    if not moves.any():
+        return [0.0] * len(points_m)
+    headings = np.arctan2(*steps[moves].T) % math.tau
+    newest = np.maximum(np.cumsum(moves) - 1, 0)  # of those before the first: the first
+    found: list[float] = headings[np.append(newest, newest[-1])].tolist()
+    return found
 
 
 # --- messages -----------------------------------------------------------------------------------------------------

@@ -13,7 +13,7 @@ from shared_map.terrain.store import load_homes
 from shared_map.terrain.terrain import Terrain
 from swarm.bus.bus import Appeared, Bus, Disappeared, Event, Heard, Post, Replied
 from swarm.clock import NS_PER_S
-from swarm.peers import HIGHEST_RANK, Roster, job_of, ranked_id
+from swarm.peers import Roster, job_of
 from swarm.runtime.election import Candidacy
 from swarm.runtime.membership import Member, MemberService
 from swarm.runtime.order_book import OrderClient
@@ -101,9 +101,8 @@ class TargetsService(MemberService):
 
     def start(self, now_ns: int) -> None:
         self._member.join()
-        self._bus.subscribe(FLEET, self._post)
-        self._bus.subscribe(OBSTACLE, self._post)
-        self._bus.subscribe(STATUS, self._post)
+        for topic in (FLEET, OBSTACLE, STATUS):
+            self._bus.subscribe(topic, self._post)
         self._bus.watch_alive(self._post, role="planner")
         self._subscribe_targets()
         self._order_client.start(now_ns)
@@ -131,12 +130,8 @@ class TargetsService(MemberService):
                 self._world.hear_planner(reply.target, reply.target_cell)
             case Appeared(peer):
                 self._planners.appeared(peer)
-                self._world.planner_up(job_of(peer.id), True)
             case Disappeared(peer):
                 self._planners.gone(peer)
-                job = job_of(peer.id)
-                ids = (ranked_id(job, rank) for rank in range(HIGHEST_RANK + 1))
-                self._world.planner_up(job, any(self._planners.is_alive(peer.role, id) for id in ids))
             case Heard(message=TargetPose() as pose):
                 self._world.hear_pose(pose, now_ns)
 
@@ -149,7 +144,8 @@ class TargetsService(MemberService):
             self._ask_due_ns = now_ns + _ASK_NS
             self._member.ask_by_name(COST, CostRequest(), tag=_ASK)
         self._obey(now_ns)
-        self._perform(self._world.tick(now_ns), now_ns)
+        planned = {job_of(id) for _, id in self._planners.up()}
+        self._perform(self._world.tick(now_ns, planned), now_ns)
         self._member.tell_faults(self._world.faults, now_ns)
         self._member.tick(now_ns)
 

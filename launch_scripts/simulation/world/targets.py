@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 import random
+from collections.abc import Collection
 from dataclasses import dataclass
 
 import numpy as np
@@ -70,7 +71,6 @@ class _Target:
     chance: random.Random
     placed: bool = False
     unheard_of: bool = False
-    planner_up: bool = False
     seq: int = 0
     captures: int = 0
     jumps: int = 0
@@ -154,7 +154,7 @@ class TargetWorld:
         plugin = find_plugin(walk_named_by(config, key), scenario.plugin_folder)
         world = walks.WalkWorld(id, self._terrain, chance, self._budget)
         walk = walks.walk_of(plugin, world, lambda fault: self.faults.append(f"target {id}: {fault}"))
-        walker = walks.Walker(id, walk, walks.slowness_of(config, scenario.cost), cell)
+        walker = walks.Walker(self._terrain, walk, walks.slowness_of(config, scenario.cost), cell)
         return _Target(config, walker, *self._grid.centre_m(cell), chance)
 
     def obey(self, book: OrderBook, scenario: Scenario, now_ns: int, *, first: bool) -> list[Action]:
@@ -217,12 +217,6 @@ class TargetWorld:
         for target in self._targets.values():
             target.unheard_of = not target.placed
 
-    def planner_up(self, id: str, up: bool) -> None:
-        """The planner of a target has appeared or gone."""
-        target = self._targets.get(id)
-        if target is not None:
-            target.planner_up = up
-
     @property
     def listening(self) -> bool:
         """Returns True if a planner may still reply with the position of an unplaced target."""
@@ -266,8 +260,11 @@ class TargetWorld:
                 actions += self._reached(id, self._targets[id], vehicle, now_ns)
         return [*actions, *seen] if self.leads else []
 
-    def tick(self, now_ns: int) -> list[Action]:
-        """Moves all targets and returns their poses."""
+    def tick(self, now_ns: int, planned: Collection[str] = ()) -> list[Action]:
+        """Moves all targets and returns their poses.
+
+        planned  targets of which a planner is alive
+        """
         if not self.leads:
             return []
         if self._started_ns is None:
@@ -279,11 +276,11 @@ class TargetWorld:
         self._budget.ways = _WAYS_PER_TICK
         actions: list[Action] = [*self._rovers.tick(time_scale, now_ns)]
         for id, target in self._targets.items():
-            patience_ns = 0 if target.unheard_of else PATIENCE_NS if target.planner_up else LISTEN_NS
+            patience_ns = 0 if target.unheard_of else PATIENCE_NS if id in planned else LISTEN_NS
             if not target.config.is_simulated or (waited_ns < patience_ns and not target.placed):
                 continue
             if target.placed:
-                target.walker.advance(self._terrain, elapsed_s, lambda: self._referee.cells)
+                target.walker.advance(elapsed_s, lambda: self._referee.cells)
             target.placed = True
             pose = self._pose(id, target, now_ns)
             self._refer(pose, now_ns)
@@ -295,7 +292,7 @@ class TargetWorld:
             self._referee.hear_obstacle(obstacle, now_ns)
 
     def _pose(self, id: str, target: _Target, now_ns: int) -> TargetPose:
-        target.x_m, target.y_m = target.walker.position_m(self._terrain)
+        target.x_m, target.y_m = target.walker.position_m()
         target.seq += 1
         return TargetPose(
             target=id,

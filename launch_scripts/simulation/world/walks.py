@@ -333,7 +333,7 @@ class PluginWalk:
 class Walker:
     """A target under way: on `cell`, or `progress_s` seconds into the step from there `towards` the next."""
 
-    id: str
+    terrain: TrueTerrain
     walk: Walk
     slowness: float
     """Factor on the pace of the terrain."""
@@ -347,7 +347,7 @@ class Walker:
         self.towards = None
         self.progress_s = 0.0
 
-    def advance(self, terrain: TrueTerrain, elapsed_s: float, vehicles: Callable[[], NDArray[np.int64]]) -> None:
+    def advance(self, elapsed_s: float, vehicles: Callable[[], NDArray[np.int64]]) -> None:
         """Moves on for some seconds. `vehicles` returns the cells that an evader keeps away from."""
         if not math.isfinite(self.slowness):
             return
@@ -356,25 +356,24 @@ class Walker:
                 self.towards = self.walk.choose(self.cell, vehicles())
                 if self.towards is None:
                     return
-            step_s = self._step_s(terrain)
+            step_s = self._step_s(self.towards)
             if self.progress_s + elapsed_s < step_s:
                 self.progress_s += elapsed_s
                 return
             elapsed_s -= step_s - self.progress_s
             self.cell, self.towards, self.progress_s = self.towards, None, 0.0
 
-    def position_m(self, terrain: TrueTerrain) -> tuple[float, float]:
+    def position_m(self) -> tuple[float, float]:
         """(x_m, y_m); while under way on the line between the centres of two cells."""
-        x_m, y_m = terrain.grid.centre_m(self.cell)
+        x_m, y_m = self.terrain.grid.centre_m(self.cell)
         if self.towards is None:
             return x_m, y_m
-        share = self.progress_s / self._step_s(terrain)
-        to_x_m, to_y_m = terrain.grid.centre_m(self.towards)
+        share = self.progress_s / self._step_s(self.towards)
+        to_x_m, to_y_m = self.terrain.grid.centre_m(self.towards)
         return x_m + share * (to_x_m - x_m), y_m + share * (to_y_m - y_m)
 
-    def _step_s(self, terrain: TrueTerrain) -> float:
-        assert self.towards is not None
-        return terrain.step_s(self.cell, self.towards) * self.slowness
+    def _step_s(self, to: int) -> float:
+        return self.terrain.step_s(self.cell, to) * self.slowness
 
 
 def slowness_of(target: TargetConfig, cost: CostConfig) -> float:

@@ -199,7 +199,7 @@ def _race(crowd: _Crowd, racers: Sequence[_Racer], plan: Plan, batches: int) -> 
 
 def _walker(field: Field, plan: Plan, n: int, cell: int) -> Walker:
     world = WalkWorld(f"t{n}", field.terrain, random.Random(plan.seed * 1000 + n), Budget())
-    return Walker(world.target, WALKS[plan.walk](world), 1.0, cell)
+    return Walker(world.terrain, WALKS[plan.walk](world), 1.0, cell)
 
 
 class _Crowd:

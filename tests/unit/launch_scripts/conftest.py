@@ -1,6 +1,8 @@
-"""The command `swarm` as a user types it."""
+"""The command `swarm` as a user types it, and a run that it may be asked about."""
 
 import sys
+from pathlib import Path
+from typing import Any
 
 import pytest
 from support.command import Swarm
@@ -23,3 +25,18 @@ def swarm(capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch) -
         return code, *capsys.readouterr()
 
     return run
+
+
+@pytest.fixture(scope="session")
+def left_run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, Any]:
+    """The folder of a run, and its recorder."""
+    from support.fake_run import leave_run  # takes time to import
+
+    folder = tmp_path_factory.mktemp("runs") / "r1"
+    folder.mkdir()
+    return folder, leave_run(folder)
+
+
+@pytest.fixture(scope="session")
+def run(left_run: tuple[Path, Any]) -> Path:
+    return left_run[0]

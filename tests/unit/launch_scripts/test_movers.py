@@ -141,17 +141,17 @@ def test_every_target_that_is_drawn_has_one_label(posed: set[str], lost: set[str
 @given(
     st.lists(
         st.builds(
-            Alarm, kind=st.sampled_from([*KINDS, "new"]),
-            about=st.sampled_from(["agent-a0", "agent-a9", "planner-t0"]), text=st.just("."),
-            since_s=st.just(1.0), over_s=st.none() | st.floats(0, 50),
-            cell=st.none() | st.integers(0, 500), target=st.none() | st.sampled_from(["t0", "t9"]),
+            lambda place, **of: Alarm(**of, row=place and place[0], col=place and place[1]),
+            place=st.none() | st.tuples(st.integers(0, 19), st.integers(0, 19)),
+            kind=st.sampled_from([*KINDS, "new"]), about=st.sampled_from(["agent-a0", "agent-a9", "planner-t0"]),
+            text=st.just("."), since_s=st.just(1.0), over_s=st.none() | st.floats(0, 50),
+            target=st.none() | st.sampled_from(["t0", "t9"]),
         ),
         max_size=40,
     ),
 )  # fmt: skip
 def test_alarms_are_marked_where_they_are_until_they_have_been_over_for_a_while(alarms: list[Alarm]) -> None:
-    grid = hill(20, 20).grid
-    marks = view.alarm_marks(alarms, 50.0, {"t0": (30.0, 40.0)}, grid)
+    marks = view.alarm_marks(alarms, 50.0, {"t0": (30.0, 40.0)}, 10.0)
     assert len(marks) <= 24
     assert all(0 <= east_m <= 200 and 0 <= south_m <= 200 for east_m, south_m in marks)
     seen = {
@@ -159,7 +159,7 @@ def test_alarms_are_marked_where_they_are_until_they_have_been_over_for_a_while(
     }
     assert set(marks.values()) <= seen
     assert bool(marks) == any(
-        f"{each.label}: {each.about}" in seen and (each.place(grid) or each.target == "t0") for each in alarms
+        f"{each.label}: {each.about}" in seen and (each.row is not None or each.target == "t0") for each in alarms
         if each.over_s is None or each.over_s >= 50 - view.OVER_S
     )  # fmt: skip
 
@@ -167,9 +167,9 @@ def test_alarms_are_marked_where_they_are_until_they_have_been_over_for_a_while(
 def test_an_alarm_has_the_place_of_its_cell_or_of_its_target() -> None:
     def places(**about: Any) -> list[tuple[float, float]]:
         alarm = Alarm(kind="down", text=".", since_s=0.0, **about)
-        return list(view.alarm_marks([alarm], 9.0, {"t0": (30.0, 40.0)}, hill(20, 20).grid))
+        return list(view.alarm_marks([alarm], 9.0, {"t0": (30.0, 40.0)}, 10.0))
 
-    assert places(about="x", cell=21, target="t0") == [(15.0, 15.0)]
+    assert places(about="x", row=1, col=1, target="t0") == [(15.0, 15.0)]
     assert places(about="planner-t0", target="t0") == [(30.0, 40.0)]
     assert places(about="keeper-0") == places(about="planner-t9", target="t9") == []
 
@@ -312,13 +312,14 @@ GRID = GridSpec(4, 7, 10.0)
 @example(-(1 << 31))
 @example(27)
 def test_an_alarm_is_told_wherever_it_says_it_is_and_has_a_place_if_that_is_in_the_grid(cell: int | None) -> None:
-    alarm = Alarm("target-lost", "t0", "nobody knows", 3.0, cell=cell, target="t0", heard_s=90.0)
-    place = divmod(cell, 7) if cell is not None and cell in range(28) else None
-    row, col = place or (None, None)
-    assert alarm.place(GRID) == place
-    assert alarm.where(GRID) == ("" if place is None else f"row {row}, col {col}")
-    assert (alarm.fields(GRID)["row"], alarm.fields(GRID)["col"]) == (row, col)
-    assert alarm.line(GRID).endswith(", for 87 s")
+    latest = LatestState(RunPlan((), (), 0, 0), GRID)
+    told = WireAlarm(kind="x", about="y", text="z", since_ns=3 * NS_PER_S, over_ns=90 * NS_PER_S, cell=cell)
+    latest.heard(stats(alarms=[told]), 2)
+    [alarm] = state_of(latest, 3).alarms
+    row, col = divmod(cell, 7) if cell is not None and cell in range(28) else (None, None)
+    assert alarm.where == ("" if row is None else f"row {row}, col {col}")
+    assert (alarm.fields()["row"], alarm.fields()["col"]) == (row, col)
+    assert alarm.line.endswith(", for 87 s")
 
 
 @given(st.text(max_size=20), st.text(max_size=20), st.text(max_size=60))
@@ -328,7 +329,7 @@ def test_an_alarm_is_one_line_that_no_terminal_obeys_whatever_it_says(kind: str,
     told = WireAlarm(kind=kind, about=about, text=text, since_ns=1, over_ns=2)
     latest.heard(stats(alarms=[told]), 2)
     [alarm] = state_of(latest, 3).alarms
-    assert alarm.line(GRID).isprintable()
+    assert alarm.line.isprintable()
     if text.isprintable():
         assert alarm.text == text
 

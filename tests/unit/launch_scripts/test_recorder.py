@@ -104,9 +104,13 @@ def status(target: str, gap_max: float | None, following: int = 1) -> PlannerSta
     return planner_status(target, stamp_ns=0, following=following, **gaps)
 
 
-def test_an_external_vehicle_is_named_until_its_lease_ends(recorder: Recorder) -> None:
+def test_an_external_vehicle_is_named_until_its_lease_ends_and_the_report_names_it_for_good(
+    recorder: Recorder,
+) -> None:
     hear(recorder, Obstacle(id="rover", incarnation=1, seq=1, x_m=0.0, y_m=0.0, radius_m=1.0, lease_s=2.0))
     assert [recorder.summary(int(at_s * NS_PER_S)).external for at_s in (1.9, 2.1)] == [("rover",), ()]
+    recorder.finish(9 * NS_PER_S)
+    assert (recorder.report()["external"], recorder.report()["external_seen"]) == ((), ["rover"])
 
 
 def test_what_nobody_told_of_is_null_and_not_zero(recorder: Recorder) -> None:
@@ -387,10 +391,10 @@ def test_messages_per_second_are_what_the_processes_that_live_say(recorder: Reco
     for second in range(4):
         told = [stats("agent", id, 1, second, gauges={"messages_per_s": 25.0}) for id in ("a0", "a1")]
         hear(recorder, *told, at_s=float(second))
-    assert recorder.summary(3 * NS_PER_S).messages_per_s == 50.0
+    assert recorder.summary(3 * NS_PER_S).messages_now_per_s == 50.0
     assert recorder.report()["messages_per_s"] == pytest.approx(50.0, rel=0.2)
     recorder.alive(Peer("agent", "a1", 1), False, 3 * NS_PER_S)
-    assert recorder.summary(3 * NS_PER_S).messages_per_s == 25.0
+    assert recorder.summary(3 * NS_PER_S).messages_now_per_s == 25.0
 
 
 def test_tracks_forget_every_second_sampling_instead_of_growing() -> None:
@@ -486,7 +490,7 @@ def test_many_alarms_of_one_process_share_a_line_among_those_of_their_kind() -> 
 
     of_keeper = [behind("keeper-0", 10.0 * n, 10.0 * n + 1 + n % 3) for n in range(5)]
     others = [behind("agent-a0", 3.0, 5.0), behind("planner-t0", 3.0, 4.0)]
-    [(line, parts)] = facts.grouped([*of_keeper, *others], GRID)
+    [(line, parts)] = facts.grouped([*of_keeper, *others])
     names = "keeper-0, agent-a0, planner-t0"
     assert line == f"behind: 7 times, {names}, the longest at 20 s of the run, for 3 s (overloaded machine)"
     assert parts == [
@@ -494,4 +498,4 @@ def test_many_alarms_of_one_process_share_a_line_among_those_of_their_kind() -> 
         "behind: agent-a0 skips, at 3 s of the run, for 2 s",
         "behind: planner-t0 skips, at 3 s of the run, for 1 s",
     ]
-    assert facts.grouped(others, GRID) == [(line, []) for line in parts[1:]], "few are said one by one"
+    assert facts.grouped(others) == [(line, []) for line in parts[1:]], "few are said one by one"

@@ -3,7 +3,6 @@
 import csv
 import dataclasses
 import datetime
-import io
 import json
 import sys
 from pathlib import Path
@@ -18,49 +17,22 @@ from pyogrio import raw
 from rasterio.features import rasterize
 from rasterio.transform import from_origin
 from support.command import Swarm
-from support.fake_run import BEGAN_NS, little_scenario, played
-from support.map_strategies import set_of
+from support.fake_run import BEGAN_NS, GRID
 
 from launch_scripts.observe.recorder import BegunRoute, Recorder
 from launch_scripts.report.gis_formats import in_degrees, write_layers
-from launch_scripts.report.report_and_tracks import TRACKS_FILE, Track, packed_tracks, read_tracks, tracks_in
+from launch_scripts.report.report_and_tracks import TRACKS_FILE, Track, packed_tracks, read_tracks
 from launch_scripts.report.run_gis_layers import ENDINGS, mark_layer, target_tracks, vehicle_tracks
-from shared_map.keeper.mark_store import KeeperStore
 from shared_map.terrain.map_frame import MapFrame
-from shared_map.terrain.terrain import terrain_of_pace
 from swarm.clock import NS_PER_S
 from swarm.errors import StoreError
 from swarm.grid import GridSpec, walk
 from swarm.wire.messages.map_data import MarkKind
 
-GRID = GridSpec(48, 64, 25.0, 500_000.0, 5_200_000.0, "EPSG:32632")
-LETHAL_CELLS = {(3, 4), (3, 5), (4, 5), (9, 9)}
 
-
-@pytest.fixture(scope="module")
-def recorder() -> Recorder:
-    scenario = little_scenario(8.0, vehicles=4, time_scale=1)
-    terrain = dataclasses.replace(terrain_of_pace(np.full((48, 64), 0.1, np.float32), 25.0), grid=GRID)
-    truth = np.array(terrain.pace_s_per_m)
-    truth[20:26, 10:40], truth[5:12, 45:55] = np.inf, 0.3
-    return played(terrain, truth, scenario)
-
-
-@pytest.fixture(scope="module")
-def run(recorder: Recorder, tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("runs") / "r1"
-    folder.mkdir()
-    (folder / TRACKS_FILE).write_bytes(packed_tracks(recorder))
-    with KeeperStore(folder / "map.sqlite") as store:
-        store.bind("fedcba9876543210", GRID)
-        marks: dict[int, tuple[MarkKind, float, int]] = {
-            row * 32 + col: (MarkKind.LETHAL, 0, BEGAN_NS) for row, col in LETHAL_CELLS
-        }
-        marks |= {
-            20 * 32 + col: (MarkKind.PACE, pace, BEGAN_NS + NS_PER_S) for col, pace in ((1, 0.5), (2, 0.5001))
-        }
-        store.save([set_of("a1.1", 0, 1, marks)])
-    return folder
+@pytest.fixture
+def recorder(left_run: tuple[Path, Recorder]) -> Recorder:
+    return left_run[1]
 
 
 def read_layers(folder: Path) -> dict[str, list[Any]]:
@@ -164,9 +136,10 @@ def test_no_route_that_leaves_the_map_harms_the_others(recorder: Recorder, tmp_p
     ]
     recorder.routes.kept = [*(BegunRoute(BEGAN_NS, each) for each in bad), *routes]
     try:
-        kept = tracks_in(packed_tracks(recorder), tmp_path)
+        (tmp_path / TRACKS_FILE).write_bytes(packed_tracks(recorder))
     finally:
         recorder.routes.kept = routes
+    kept = read_tracks(tmp_path / TRACKS_FILE)
     assert [route.vehicle for route in kept.routes] == [each.route.vehicle for each in routes]
     assert [route.cells.tolist() for route in kept.routes] == [
         walk(GRID, each.route.start, each.route.directions) for each in routes
@@ -249,10 +222,11 @@ def test_what_cannot_be_exported_is_said_in_a_sentence(run: Path, tmp_path: Path
         {"grid": np.array('{"rows": 2, "cols": 2, "resolution_m": 1.0, "crs": 5}')},
     ],
 )
-def test_tracks_that_nothing_could_have_left_are_damaged(run: Path, changed: dict[str, NDArray[Any]]) -> None:
+def test_tracks_that_nothing_could_have_left_are_damaged(
+    run: Path, tmp_path: Path, changed: dict[str, NDArray[Any]]
+) -> None:
     with np.load(run / TRACKS_FILE) as arrays:
         columns = {**arrays, **changed}
-    file = io.BytesIO()
-    np.savez(file, allow_pickle=False, **columns)
-    with pytest.raises(StoreError, match=r"^t\.npz is damaged: "):
-        tracks_in(file.getvalue(), Path("t.npz"))
+    np.savez(tmp_path / "t.npz", allow_pickle=False, **columns)
+    with pytest.raises(StoreError, match=r"t\.npz is damaged: "):
+        read_tracks(tmp_path / "t.npz")

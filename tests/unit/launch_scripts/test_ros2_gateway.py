@@ -340,15 +340,14 @@ def test_odometry_and_poses_in_place_have_the_bytes_of_new_ones(frame: str, chil
         assert pose.at(stamp_ns, [spot]) == TYPES.pack(messages.pose_stamped(stamp_ns, *spot), POSE)
 
 
-@given(st.lists(st.tuples(FRAMES, FRAMES, SPOTS), max_size=4), STAMPS)
+@given(st.lists(st.tuples(st.tuples(FRAMES, FRAMES), SPOTS), max_size=4), STAMPS)
 def test_transforms_in_place_have_the_bytes_of_new_ones(vehicles: Any, stamp_ns: int) -> None:
     messages = RosMessages(TYPES, RosMap(GRID))
-    made = [
-        messages.transform(stamp_ns, (parent, child), messages.map.to_ros(x_m, y_m), heading_rad)
-        for parent, child, (x_m, y_m, heading_rad) in vehicles
-    ]
-    packed = packed_transforms(messages, [(parent, child) for parent, child, _ in vehicles])
-    assert packed.at(stamp_ns, [spot for *_, spot in vehicles]) == TYPES.pack(messages.transforms(made), TRANSFORMS)
+    made = (
+        messages.transform(stamp_ns, frames, messages.map.to_ros(*xy), turn) for frames, (*xy, turn) in vehicles
+    )
+    packed = packed_transforms(messages, [frames for frames, _ in vehicles])
+    assert packed.at(stamp_ns, [spot for _, spot in vehicles]) == TYPES.pack(messages.transforms(made), TRANSFORMS)
 
 
 # --- peers -------------------------------------------------------------------------------------------------------

@@ -1,6 +1,7 @@
 """An observer from outside goes by the run that most of the answers name, and names those that do not fit."""
 
 import io
+from typing import Any
 
 import msgspec
 from rich.console import Console
@@ -21,15 +22,17 @@ from swarm.wire.messages.processes import Stats
 from swarm.wire.messages.vehicles import Obstacle
 from swarm.wire.topics import FLEET, RUN, STATS
 
-INFO = keeper_info(GridSpec(40, 50, 10.0))
+INFO = keeper_info(GridSpec(4, 5, 90.0))
 
 
-def answered(observer: OutsideObserver, *runs: str, now_ns: int = 0) -> None:
-    """One round of answers, each of another agent."""
-    for n, run_id in enumerate(runs):
-        info = msgspec.structs.replace(INFO, role="agent", id=f"a{n}", run_id=run_id)
+def answered(observer: OutsideObserver, *runs: str, now_ns: int = 0, **wire_versions: int) -> None:
+    """One round of answers, each of another agent: of these runs, or with these wire versions."""
+    told: list[dict[str, Any]] = [{"id": f"a{n}", "run_id": run_id} for n, run_id in enumerate(runs)]
+    told += [{"id": id, "wire_version": wire, "crew": ["agent-gone"]} for id, wire in wire_versions.items()]
+    for fields in told:
+        info = msgspec.structs.replace(INFO, role="agent", **fields)
         observer.take(Replied("observer-run", RUN, {}, info), now_ns)
-    observer.take(AskEnded("observer-run", RUN, len(runs), None), now_ns)
+    observer.take(AskEnded("observer-run", RUN, len(told), None), now_ns)
 
 
 def outside(*, follows: bool = False) -> OutsideObserver:
@@ -46,7 +49,7 @@ def test_what_was_heard_before_the_members_answered_is_part_of_the_run() -> None
     observer.take(Appeared(Peer("agent", "a0", 1)), 6)
     answered(observer, "r1")
     latest = observer.latest
-    assert latest.grid.rows == 40
+    assert latest.grid.rows == 4
     assert latest.vehicles().ids == ["a0-00"]
     assert latest.up() == [("agent", "a0")]
     assert latest.first_ns == 5
@@ -90,8 +93,7 @@ def test_one_that_follows_forgets_the_run_before_but_not_who_is_there() -> None:
 
 def test_only_what_is_due_is_taken_and_at_the_end_all_of_it() -> None:
     swarm = SwarmModel()
-    latest = outside()
-    observer = RunObserver(swarm.bus("inside"), lambda _: None, latest, {FLEET: 1.0, STATS: 0.0})
+    observer = RunObserver(swarm.bus("inside"), lambda _: None, None, {FLEET: 1.0, STATS: 0.0})
     observer.keep_samples()
     agent = swarm.bus("agent")
     for tick in range(4):
@@ -109,16 +111,11 @@ def test_only_what_is_due_is_taken_and_at_the_end_all_of_it() -> None:
 
 # --- `swarm status` during an upgrade -----------------------------------------------------------------------------
 
-MEMBER = keeper_info(GridSpec(4, 5, 90.0))
-
 
 def told_by(**wire_versions: int) -> Status:
     """The status once agents with these wire versions have answered."""
-    observer = OutsideObserver(SwarmModel().bus("status"), lambda _: None)
-    for id, wire in wire_versions.items():
-        info = msgspec.structs.replace(MEMBER, role="agent", id=id, wire_version=wire, crew=["agent-gone"])
-        observer.take(Replied("observer-run", RUN, {}, info), 0)
-    observer.take(AskEnded("observer-run", RUN, len(wire_versions), None), 0)
+    observer = outside()
+    answered(observer, **wire_versions)
     return status_of(observer, 0)
 
 

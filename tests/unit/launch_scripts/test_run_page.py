@@ -1,6 +1,5 @@
 """The page of a run and its recording for Foxglove."""
 
-import dataclasses
 import html.parser
 import itertools
 import json
@@ -19,43 +18,14 @@ from hypothesis import strategies as st
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from support.command import Swarm
-from support.fake_run import BEGAN_NS, leave, little_scenario, played
+from support.fake_run import BEGAN_NS, GRID, HOSTILE
 
 from launch_scripts.gateways.ros2.ros_messages import RosMap, ros_name
 from launch_scripts.observe.summed_counts import percent
 from launch_scripts.report.mcap_export import export_mcap, frame_names, instants_of, lines_of
 from launch_scripts.report.report_and_tracks import GROUND_PACE_FILE, TRACKS_FILE, RunTracks, read_tracks
-from shared_map.terrain.terrain import terrain_of_pace
 from swarm.clock import NS_PER_S
-from swarm.config.toml_files import scenario_text
-from swarm.grid import GridSpec
 from swarm.wire.messages.map_data import STAMP_LIMIT_NS, MarkKind
-from swarm.wire.messages.processes import Note
-
-HOSTILE = "<script>alert(1)</script>\"'><img src=http://example.org/x onerror=alert(2)>"
-
-
-GRID = GridSpec(48, 64, 25.0, 500_000.0, 5_200_000.0, "EPSG:32632")
-
-
-@pytest.fixture(scope="module")
-def run(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """A run's folder with a name in its notes, and in its scenario, that would rather be a script."""
-    folder = tmp_path_factory.mktemp("runs") / "r1"
-    folder.mkdir()
-    zone = "[[cost.zones]]\nkind = 'forbidden'\npolygon_m = [[200, 200], [800, 200], [800, 600], [200, 600]]\n"
-    scenario = little_scenario(20.0, vehicles=4, more=zone)
-    pace = np.full((48, 64), 0.1, np.float32)
-    pace[30:, 20:40], pace[8:24, 8:32] = 0.4, np.inf
-    terrain = dataclasses.replace(terrain_of_pace(pace, 25.0), grid=GRID)
-    truth = np.array(pace)
-    truth[28:40, 8:60], truth[5:12, 45:55] = np.inf, 0.3
-    recorder = played(terrain, truth, scenario)
-    note = Note(role="agent", id="a0", stamp_ns=1, kind="odd", text=HOSTILE, cell=None, target=None)
-    recorder.heard(note, recorder.observed.last_ns or 0)
-    (folder / "scenario.toml").write_text(f"# {HOSTILE}\n" + scenario_text(scenario, folder))
-    leave(folder, recorder, terrain, truth)
-    return folder
 
 
 class Reader(html.parser.HTMLParser):

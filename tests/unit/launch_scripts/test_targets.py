@@ -55,11 +55,12 @@ class World:
         self.grid = self.terrain.grid
         self.world = TargetWorld(scenario(*targets, **fields), self.terrain, pace, incarnation)
         self.now_ns = 10 * NS_PER_S
+        self.planned: set[str] = set()
 
     def tick(self, count: int = 1) -> list[Action]:
         actions: list[Action] = []
         for _ in range(count):
-            actions = self.world.tick(self.now_ns)
+            actions = self.world.tick(self.now_ns, self.planned)
             self.now_ns += TICK
         return actions
 
@@ -162,8 +163,7 @@ def test_a_restarted_driver_goes_on_where_planners_last_saw_the_targets() -> Non
 
 def test_a_driver_waits_longer_for_a_planner_that_is_alive_but_silent() -> None:
     world = World(TargetConfig(count=3))
-    world.world.planner_up("t0", True)
-    world.world.planner_up("t1", True)
+    world.planned = {"t0", "t1"}
     world.world.hear_planner("t1", None)
     assert list(world.poses()) == ["t1"]
     world.settle()
@@ -174,7 +174,7 @@ def test_a_driver_waits_longer_for_a_planner_that_is_alive_but_silent() -> None:
 
 def test_in_a_run_that_begins_all_targets_are_placed_at_once() -> None:
     world = World(TargetConfig(count=2), still(name="s"))
-    world.world.planner_up("t0", True)
+    world.planned = {"t0"}
     assert world.poses() == {}
     world.world.begin_anew()
     assert sorted(world.poses()) == ["s", "t0", "t1"]

@@ -55,7 +55,7 @@ def walker(
     budget: Budget | None = None,
 ) -> Walker:
     world = WalkWorld("t", where, random.Random(seed), budget or Budget())
-    return Walker("t", WALKS[walk](world), slowness, cell)
+    return Walker(where, WALKS[walk](world), slowness, cell)
 
 
 @pytest.mark.parametrize("walk", ["random", "waypoints", "evade"])
@@ -77,7 +77,7 @@ def test_no_target_takes_a_step_that_is_too_steep_and_none_outruns_the_climb(wal
         assert climb.allows(before, one.towards)
         level_s = where.length_m(before, one.towards) * where.pace_s_per_m.item(one.towards)
         elapsed_s = level_s * climb.of_step(before, one.towards) * 1.0001
-        one.advance(where, elapsed_s, partial(np.array, [before - 34]))
+        one.advance(elapsed_s, partial(np.array, [before - 34]))
         assert one.cell != before
         downhill += heights.flat[one.cell] < heights.flat[before]
     assert walk == "evade" or downhill > 0
@@ -113,7 +113,7 @@ def test_every_step_of_every_walk_is_legal(seed: int, walk: Walk) -> None:
     vehicles = where.home[:3]
     for _ in range(80):
         before, heading_to = one.cell, one.towards
-        one.advance(where, 3.0, lambda: vehicles)
+        one.advance(3.0, lambda: vehicles)
         if one.towards is not None:
             assert one.towards in [to for _, to in where.steps(one.cell)]
         assert not where.lethal(one.cell)
@@ -156,8 +156,8 @@ def test_ten_seconds_of_driving(speed: float, pace: float, metres: float) -> Non
     assert isinstance(one.walk, Waypoints)
     one.walk.way, one.walk.led_to = list(range(39, 0, -1)), 0
     for _ in range(100):
-        one.advance(where, 0.1, lambda: NOBODY)
-    x_m, _ = one.position_m(where)
+        one.advance(0.1, lambda: NOBODY)
+    x_m, _ = one.position_m()
     assert x_m - 5.0 == pytest.approx(metres, abs=1e-4)
 
 
@@ -166,7 +166,7 @@ def test_an_evader_gets_away_from_the_vehicles_near_it() -> None:
     grid = where.grid
     one = walker(where, grid.cell(20, 25), "evade")
     vehicles = np.array([grid.cell(20, 22), grid.cell(18, 23)])
-    one.advance(where, 8.0, lambda: vehicles)
+    one.advance(8.0, lambda: vehicles)
     assert min(grid.distance_cells(one.cell, cell) for cell in vehicles.tolist()) >= 7
 
 
@@ -177,7 +177,7 @@ def test_ways_are_computed_one_a_tick() -> None:
     for ticked in range(1, 5):
         budget.ways = 1
         for one in walkers:
-            one.advance(where, 0.1, lambda: NOBODY)
+            one.advance(0.1, lambda: NOBODY)
         assert sum(1 for one in walkers if one.towards is not None) == ticked
 
 
