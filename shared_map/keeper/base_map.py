@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import logging
+import threading
 import time
 import zlib
 from collections.abc import Iterator
@@ -25,6 +26,7 @@ from swarm.bus.bus import Asked, Bus, Event
 from swarm.config.ground import CostConfig
 from swarm.errors import ProtocolError, TerrainError
 from swarm.grid import REGION_CELLS, GridSpec, Window
+from swarm.runtime.inbox import Inbox
 from swarm.runtime.operator import replies_to
 from swarm.wire.messages import Nothing
 from swarm.wire.messages.map_data import BASE_DIGEST_BYTES, BaseMap, BaseMapRequest, BaseMapTile
@@ -52,6 +54,7 @@ LAYERS = {
 }
 _PIECES_KEPT = 1024
 """Packed pieces that a keeper keeps, at most 64 MiB: machines often start together."""
+_LONGEST_WAIT_S = 3600.0
 _PIECES_PER_REQUEST = 64
 """Pieces of at most 64 KiB each: the largest cost of one reply to a keeper."""
 
@@ -115,33 +118,47 @@ def pack(terrain: Terrain, layer: str, region: int) -> BaseMapTile:
 
 
 class BaseMapServer:
-    """Answers for a terrain, which never changes: so on the bus's own thread, beside the keeper's loop, which a
+    """Answers for a terrain, which never changes: so on a thread of its own, beside the keeper's loop, which a
     large map must not hold up. Pieces are packed once and kept."""
 
     def __init__(self, terrain: Terrain, keeper: str) -> None:
         self._terrain = terrain
         self._keeper = keeper
         self._packed = lru_cache(_PIECES_KEPT)(self._pack)
+        self._inbox = Inbox()
+        self._thread: threading.Thread | None = None
+        self._starting = threading.Lock()
+        """Held to make the thread."""
 
     def start(self, bus: Bus) -> None:
         """Serves the description, and pieces."""
-        bus.serve(BASE_MAP, self.answer_map, keeper=self._keeper)
-        bus.serve(BASE_TILES, self.answer_tiles, keeper=self._keeper)
+        bus.serve(BASE_MAP, self._post, keeper=self._keeper)
+        bus.serve(BASE_TILES, self._post, keeper=self._keeper)
 
-    def answer_map(self, event: Event) -> None:
-        """Answers what the terrain is."""
-        assert isinstance(event, Asked)
-        event.answer(self._described)
-        event.end()
+    def _post(self, event: Event) -> None:
+        """Leaves a question to the thread; one of a simulated network, which comes decoded, is answered at once."""
+        if isinstance(event, Asked):
+            self._answer(event)
+            return
+        with self._starting:
+            if self._thread is None:
+                self._thread = threading.Thread(target=self._work, name="base-map", daemon=True)
+                self._thread.start()
+        self._inbox.post(event)
 
-    def answer_tiles(self, event: Event) -> None:
-        """Answers with the pieces that are asked for, or says why there are none."""
-        assert isinstance(event, Asked)
+    def _work(self) -> None:
+        while True:
+            event = self._inbox.take(_LONGEST_WAIT_S)
+            if isinstance(event, Asked):
+                self._answer(event)
+
+    def _answer(self, event: Asked) -> None:
+        """Answers what the terrain is, or with the pieces that are asked for, or says why there are none."""
         request = event.request
-        assert isinstance(request, BaseMapRequest)
         regions = self._terrain.grid.regions
-        unknown = [layer for layer in request.layers if layer not in LAYERS]
-        if unknown:
+        if not isinstance(request, BaseMapRequest):
+            event.answer(self._described)
+        elif unknown := [layer for layer in request.layers if layer not in LAYERS]:
             event.refuse(f"there is no layer {unknown[0][:40]!r}; there are {', '.join(LAYERS)}")
         elif len(request.layers) * len(request.regions) > _PIECES_PER_REQUEST:
             event.refuse(f"at most {_PIECES_PER_REQUEST} pieces in one request")

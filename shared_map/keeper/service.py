@@ -165,6 +165,7 @@ class KeeperService(MemberService):
     def tick(self, now_ns: int) -> None:
         while self._zones_held and self._can_draw():
             self._order_zone(*self._zones_held.pop(0), now_ns)
+        self._sync.take_in(now_ns)
         if now_ns >= self._save_due_ns:
             self._save(now_ns)
         if now_ns >= self._compact_due_ns and not self._keeper.waiting:
@@ -183,6 +184,7 @@ class KeeperService(MemberService):
         self._member.tick(now_ns)
 
     def stop(self, now_ns: int) -> None:
+        self._sync.take_in(now_ns)
         self._save(now_ns)
         self._member.publish_stats(now_ns)
 

@@ -32,7 +32,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Protocol, TypeVar
@@ -139,17 +139,6 @@ class Heard:
     topic: Topic
     fields: Mapping[str, str]
     message: Message
-
-
-@dataclass(frozen=True, slots=True)
-class HeardMany:
-    """Samples that waited together on a topic subscribed to with `together`, in the order of their arrival.
-
-    samples  (key below the namespace, message); the key is not yet compared with the message
-    """
-
-    topic: Topic
-    samples: Sequence[tuple[str, Message]]
 
 
 class Question:
@@ -298,7 +287,7 @@ class WorkDone:
     took_ns: int
 
 
-Event = Heard | HeardMany | Asked | Undecoded | Replied | AskEnded | Appeared | Disappeared | LinkChanged | WorkDone
+Event = Heard | Asked | Undecoded | Replied | AskEnded | Appeared | Disappeared | LinkChanged | WorkDone
 Post = Callable[[Event], None]
 
 
@@ -317,9 +306,9 @@ class Answerer(Protocol):
     def end(self) -> None: ...
 
 
-def check_subscription(topic: Topic, together: bool, every_s: float) -> None:
+def check_subscription(topic: Topic, every_s: float) -> None:
     """Raises TypeError on a subscription that the topic does not allow."""
-    if every_s and (together or not topic.newest):
+    if every_s and not topic.newest:
         raise TypeError(f"topic {topic.name} cannot be sampled: each of its messages counts")
 
 
@@ -374,16 +363,12 @@ class Bus(Protocol):
         process hears its own samples. Nothing is sent after `close`."""
         ...
 
-    def subscribe(
-        self, topic: Topic, post: Post, *, together: bool = False, every_s: float = 0.0, **fields: str | int
-    ) -> None:
+    def subscribe(self, topic: Topic, post: Post, *, every_s: float = 0.0, **fields: str | int) -> None:
         """Posts `Heard` for every sample from now on.
 
-        together  post `HeardMany` of all samples that wait, for a topic of many small messages; the reader
-                  compares each key with its message
-        every_s   post the newest sample of each key only, once per this interval (s): for a reader that is slower
-                  than the topic. Samples that it does not read are not decoded. Only for topics of which the newest
-                  counts
+        every_s  post the newest sample of each key only, once per this interval (s): for a reader that is slower
+                 than the topic. Samples that it does not read are not decoded. Only for topics of which the newest
+                 counts
         """
         ...
 
@@ -403,8 +388,8 @@ class Bus(Protocol):
         ...
 
     def collected_together(self, topic: Topic) -> list[tuple[str, Message]]:
-        """Returns all samples gathered on a topic since the last call, in order, with keys as in a `HeardMany`: for
-        a topic with many small messages. The reader compares each key with its message."""
+        """Returns (key below the namespace, message) of all samples gathered on a topic since the last call, in
+        order: for a topic with many small messages. The reader compares each key with its message."""
         ...
 
     def unsubscribe(self, topic: Topic, **fields: str | int) -> None:
@@ -412,11 +397,9 @@ class Bus(Protocol):
         under way may be posted after it."""
         ...
 
-    def serve(self, topic: Topic, post: Post, *, undecoded: bool = False, **fields: str | int) -> None:
-        """Posts `Asked` for every query on the key. Raises TypeError on a topic without requests.
-
-        undecoded  `post` is an inbox's, and may be given `Undecoded`: no thread has to wake up only to decode it
-        """
+    def serve(self, topic: Topic, post: Post, **fields: str | int) -> None:
+        """Posts every query on the key: as `Asked`, or `Undecoded`, so that no thread has to wake up only to decode
+        it. Raises TypeError on a topic without requests."""
         ...
 
     def unserve(self, topic: Topic, **fields: str | int) -> None:

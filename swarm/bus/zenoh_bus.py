@@ -1,11 +1,10 @@
 """The bus of real processes, on one Zenoh session.
 
-Each subscription and queryable has a thread that reads its channel. The exception is a queryable whose queries are
-decoded by an inbox: those are posted on Zenoh's own thread (docs/design/zenoh-topology-and-inboxes.md). Three other
-choices rest on measurements. Subscriptions have channels that drop their oldest sample when full: with a FIFO a
-stalled reader holds up queries on the same link. Replies are posted on Zenoh's own thread: a thread per query is
-ten times slower. Queries, tokens and links are rare and have no channel of Zenoh's: a thread that waits on one
-wakes ten times a second for nothing (`Arrivals`)."""
+Each subscription that is not collected has a thread that reads its channel; all else is posted on Zenoh's own
+threads, queries undecoded (docs/design/zenoh-topology-and-inboxes.md). Three choices rest on measurements.
+Subscriptions have channels that drop their oldest sample when full: with a FIFO a stalled reader holds up queries
+on the same link. A thread per query for its replies is ten times slower. Queries, tokens and links are rare: a
+thread that waits for them on a channel of Zenoh's wakes ten times a second for nothing."""
 
 from __future__ import annotations
 
@@ -24,8 +23,6 @@ import zenoh
 
 from swarm.bus import zenoh_intake
 from swarm.bus.bus import (
-    QUESTION_BYTES,
-    QUESTION_COST_BYTES,
     TIMEOUT_PARAMETER,
     USUAL_TIMEOUT_S,
     Appeared,
@@ -33,7 +30,6 @@ from swarm.bus.bus import (
     AskEnded,
     Disappeared,
     Heard,
-    HeardMany,
     LinkChanged,
     Post,
     Replied,
@@ -137,8 +133,6 @@ _PRIORITIES = {
     Priority.DATA: zenoh.Priority.DATA,
     Priority.BACKGROUND: zenoh.Priority.BACKGROUND,
 }
-_TOKEN_BUFFER = 65_536
-"""Changes of tokens, or of links, that wait to be read: more than processes can start in a second."""
 _CLOSE_S = 3.0
 """Time for which `close` waits for an unresponsive router (s)."""
 
@@ -260,15 +254,8 @@ class ZenohBus:
             allowed_destination=zenoh.Locality.ANY if topic.echoed else zenoh.Locality.REMOTE,
         )
 
-    def subscribe(
-        self, topic: Topic, post: Post, *, together: bool = False, every_s: float = 0.0, **fields: str | int
-    ) -> None:
-        check_subscription(topic, together, every_s)
-
-        def arrive_together(samples: list[zenoh.Sample]) -> None:
-            heard = self.intake.together(topic, samples)
-            if heard:
-                post(HeardMany(topic, heard))
+    def subscribe(self, topic: Topic, post: Post, *, every_s: float = 0.0, **fields: str | int) -> None:
+        check_subscription(topic, every_s)
 
         def arrive(samples: list[zenoh.Sample]) -> None:
             for heard in self.intake.newest(topic, samples):
@@ -276,13 +263,8 @@ class ZenohBus:
 
         subscriber = self._subscriber(topic, fields)
         channel = subscriber.handler  # a thread that waits on the subscriber itself keeps it from being undeclared
-        name = f"sub-{topic.name}"
-        if together:
-            self._read(subscriber, arrive_together, name, partial(zenoh_intake.waiting_in, channel))
-        elif every_s:
-            self._read(subscriber, arrive, name, partial(zenoh_intake.taken_after, channel, self._closing, every_s))
-        else:
-            self._read(subscriber, arrive, name, lambda: [channel.recv()])
+        take = partial(zenoh_intake.taken_after, channel, self._closing, every_s)
+        self._read(subscriber, arrive, f"sub-{topic.name}", take if every_s else lambda: [channel.recv()])
 
     def collect(self, topic: Topic, **fields: str | int) -> None:
         subscriber = self._subscriber(topic, fields)
@@ -327,12 +309,10 @@ class ZenohBus:
         self._subscribers.setdefault(expression, []).append(subscriber)
         return subscriber
 
-    def serve(self, topic: Topic, post: Post, *, undecoded: bool = False, **fields: str | int) -> None:
+    def serve(self, topic: Topic, post: Post, **fields: str | int) -> None:
         if topic.request is None:
             raise TypeError(f"topic {topic.name} is not a queryable")
         concrete = {name: str(value) for name, value in fields.items()}
-
-        arrivals = zenoh_intake.Arrivals(QUESTION_BYTES, lambda answerer: QUESTION_COST_BYTES + answerer.size)
 
         def enter(query: zenoh.Query) -> None:
             answerer = ZenohAnswerer(self, topic, concrete, query)
@@ -340,24 +320,14 @@ class ZenohBus:
                 answerer.end()
             elif answerer.size > topic.ask_bytes:
                 answerer.decoded()  # which rejects it
-            elif undecoded:
+            else:
                 asker = asker_in(topic.parse(self._namespace, str(query.key_expr)) or {})
                 post(Undecoded(topic, answerer, answerer.decoded, asker))
-            elif not arrivals.put(answerer):
-                answerer.end()
-
-        def arrive(answerer: ZenohAnswerer) -> None:
-            if (asked := answerer.decoded()) is not None:
-                post(asked)
 
         expression = self._pattern(topic, fields)
-        into = zenoh.handlers.Callback(zenoh_intake.guarded(enter), arrivals.end, indirect=False)
-        queryable = self._session.declare_queryable(expression, into)
+        queryable = self._session.declare_queryable(expression, _calling(enter))
         self._queryables.setdefault(expression, []).append(queryable)
-        if undecoded:
-            self._entities.append(queryable)
-        else:
-            self._read(queryable, arrive, f"serve-{topic.name}", arrivals.take)
+        self._entities.append(queryable)
 
     def unserve(self, topic: Topic, **fields: str | int) -> None:
         self._undeclare_all(self._queryables.pop(self._pattern(topic, fields), ()))
@@ -409,7 +379,7 @@ class ZenohBus:
         self.intake.sent(asked)
         self._session.get(
             f"{expression}?{TIMEOUT_PARAMETER}={timeout_s}",
-            zenoh.handlers.Callback(zenoh_intake.guarded(arrive), zenoh_intake.guarded(finish), indirect=False),
+            _calling(arrive, finish),
             target=zenoh.QueryTarget.ALL,
             consolidation=zenoh.ConsolidationMode.NONE,
             timeout=timeout_s,
@@ -437,19 +407,17 @@ class ZenohBus:
             post(Appeared(peer) if sample.kind == zenoh.SampleKind.PUT else Disappeared(peer))
 
         key = ALIVE_KEY.format(role=role, id="*", incarnation="*")
-        arrivals = zenoh_intake.Arrivals(_TOKEN_BUFFER)
         subscriber = self._session.liveliness().declare_subscriber(
-            patterned(f"{self._namespace}/{key}"), _into(arrivals), history=True
+            patterned(f"{self._namespace}/{key}"), _calling(arrive), history=True
         )
-        self._read(subscriber, arrive, "alive", arrivals.take)
+        self._entities.append(subscriber)
 
     def watch_links(self, post: Post) -> None:
         def arrive(event: Any) -> None:
             post(LinkChanged(up=event.kind == zenoh.SampleKind.PUT))
 
-        arrivals = zenoh_intake.Arrivals(_TOKEN_BUFFER)
-        listener = self._session.info.declare_transport_events_listener(_into(arrivals), history=False)
-        self._read(listener, arrive, "links", arrivals.take)
+        listener = self._session.info.declare_transport_events_listener(_calling(arrive), history=False)
+        self._entities.append(listener)
 
     def close(self) -> None:
         """Leaves the network, within `_CLOSE_S` even if the router hangs, for which Zenoh waits ten seconds.
@@ -486,15 +454,14 @@ class ZenohBus:
 
     def _read(self, entity: Any, arrive: Callable[[Any], None], name: str, take: Callable[[], Any]) -> None:
         """Makes what `take` returns arrive, one after the other on a thread of its own, until the entity is
-        undeclared: then `take` returns None or raises ZError."""
+        undeclared: then `take` raises ZError."""
         self._entities.append(entity)
 
         def run() -> None:
             try:
-                for item in iter(take, None):
-                    arrive(item)
-                raise BusError(f"{name} receives no more messages")
-            except (BusError, zenoh.ZError):
+                while True:
+                    arrive(take())
+            except zenoh.ZError:
                 if not self.closed and entity in self._entities:
                     raise  # it has ended by itself
 
@@ -503,6 +470,7 @@ class ZenohBus:
         self._threads.append(thread)
 
 
-def _into(arrivals: zenoh_intake.Arrivals) -> Any:
-    """Returns the handler with which an entity is declared, which leaves its items there."""
-    return zenoh.handlers.Callback(arrivals.put, arrivals.end, indirect=False)
+def _calling(arrive: Callable[[Any], None], finish: Callable[[], None] | None = None) -> Any:
+    """Returns the handler of what arrives on Zenoh's own threads. `finish` is called once nothing more arrives."""
+    ends = None if finish is None else zenoh_intake.guarded(finish)
+    return zenoh.handlers.Callback(zenoh_intake.guarded(arrive), ends, indirect=False)

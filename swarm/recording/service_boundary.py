@@ -175,11 +175,9 @@ class BoundaryBus:
         self._crossing.let_out(f"put {topic.below(topic.one(fields))}", content_of(message), message)
         self._bus.publish(topic, message, **fields)
 
-    def subscribe(
-        self, topic: Topic, post: Post, *, together: bool = False, every_s: float = 0.0, **fields: str | int
-    ) -> None:
-        self._says("subscribe", topic, fields, f" together={together} every_s={every_s:g}")
-        self._bus.subscribe(topic, post, together=together, every_s=every_s, **fields)
+    def subscribe(self, topic: Topic, post: Post, *, every_s: float = 0.0, **fields: str | int) -> None:
+        self._says("subscribe", topic, fields, f" every_s={every_s:g}")
+        self._bus.subscribe(topic, post, every_s=every_s, **fields)
 
     def collect(self, topic: Topic, **fields: str | int) -> None:
         self._says("collect", topic, fields)
@@ -219,9 +217,9 @@ class BoundaryBus:
         self._says("unsubscribe", topic, fields)
         self._bus.unsubscribe(topic, **fields)
 
-    def serve(self, topic: Topic, post: Post, *, undecoded: bool = False, **fields: str | int) -> None:
+    def serve(self, topic: Topic, post: Post, **fields: str | int) -> None:
         self._says("serve", topic, fields)
-        self._bus.serve(topic, post, undecoded=undecoded, **fields)
+        self._bus.serve(topic, post, **fields)
 
     def unserve(self, topic: Topic, **fields: str | int) -> None:
         self._says("unserve", topic, fields)

@@ -341,7 +341,6 @@ class ExternalSession:
             with self._changed:
                 self._closed.set()
                 self._service.stop()
-            self._inbox.close()
             self._thread.join(2 * _TICK_S + 1.0)
             self._bus.close()
             self._generations.close()

@@ -122,39 +122,6 @@ def test_many_threads_may_post(inbox):
         assert [e.message.seq for e in taken if e.fields.get("target") == name] == [499]
 
 
-def batch(n: int) -> bus.HeardMany:
-    return bus.HeardMany(NOTE, [(f"note/agent/a{n}", note(n).message)])
-
-
-def test_who_brings_batches_waits_until_the_owner_has_kept_up(inbox):
-    brought: list[int] = []
-
-    def bring() -> None:
-        for n in range(10):
-            inbox.post(batch(n))
-            brought.append(n)
-
-    bringer = threading.Thread(target=bring)
-    bringer.start()
-    taken = []
-    while len(taken) < 10:
-        event = inbox.take(1.0)
-        taken.append(event)
-        assert len(brought) <= len(taken) + 3
-    bringer.join(1.0)
-    assert taken == [batch(n) for n in range(10)]
-
-
-def test_nobody_waits_for_an_owner_that_has_ended(inbox):
-    bringer = threading.Thread(target=lambda: [inbox.post(batch(n)) for n in range(5)])
-    bringer.start()
-    bringer.join(0.1)
-    assert bringer.is_alive()
-    inbox.close()
-    bringer.join(1.0)
-    assert not bringer.is_alive()
-
-
 def test_a_take_waits_for_a_post_and_no_longer(inbox):
     threading.Timer(0.05, inbox.post, [note("x")]).start()
     began_s = time.monotonic()
