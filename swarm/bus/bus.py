@@ -151,11 +151,6 @@ class Question:
     """Name of the asker, as its key says; "" if the key names none."""
 
     @property
-    def size(self) -> int:
-        """Bytes of the request, as it came."""
-        return self.answerer.size
-
-    @property
     def timeout_s(self) -> float:
         """Time for which the asker waits (s). It travels with the query, as a duration: no clock is compared with
         another."""
@@ -298,7 +293,9 @@ class Answerer(Protocol):
     def timeout_s(self) -> float: ...
 
     @property
-    def size(self) -> int: ...
+    def size(self) -> int:
+        """Bytes of the request, as it came."""
+        ...
 
     def waited_s(self) -> float: ...
     def answer(self, message: Message, fields: Mapping[str, str | int]) -> None: ...
@@ -343,15 +340,12 @@ def counter_of(error: ProtocolError) -> str:
 class Bus(Protocol):
     """The network of one process. Keyword `fields` fill the topic's key; those not given are wildcards.
 
+    namespace     the first chunk of all keys
     proves_names  certificates prove who sends a message under a key that bears the sender's name
     """
 
+    namespace: str
     proves_names: bool
-
-    @property
-    def namespace(self) -> str:
-        """The first chunk of all keys."""
-        ...
 
     @property
     def counts(self) -> Mapping[str, int]:

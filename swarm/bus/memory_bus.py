@@ -120,10 +120,9 @@ class MemoryAnswerer:
         if self.ended:
             raise RuntimeError("answered after the end")
         asking, bus = self.asking, self.queryable.bus
-        named = asking.topic.one({**self.queryable.narrow, **fields})
+        named, key = asking.topic.value({**self.queryable.narrow, **fields})
         if bus.closed or any(chunk not in (named[name], "*") for name, chunk in asking.wanted.items()):
             return
-        key = asking.topic.below(named)
         payload = meant_for(key, encode(message))
         bus.sent(payload)
         code = code_of(bus.authenticator, key, payload, asking.asked)

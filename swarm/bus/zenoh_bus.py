@@ -187,10 +187,12 @@ class ZenohBus:
     """
 
     def __init__(self, session: zenoh.Session, namespace: str, authenticator: Authenticator | None = None) -> None:
-        self._session = session
+        self.session = session
+        """The raw session, also for measurements beside the bus."""
         self.proves_names = False
-        self._namespace = namespace
+        self.namespace = namespace
         self.intake = zenoh_intake.Intake(namespace, authenticator)
+        self.counts = self.intake.counts
         self._own_peers: list[Peer] = []
         """Our tokens, of which `watch_alive` does not tell."""
         self._entities: list[Any] = []
@@ -208,14 +210,6 @@ class ZenohBus:
         atexit.register(self.close)
 
     @property
-    def namespace(self) -> str:
-        return self._namespace
-
-    @property
-    def counts(self) -> Mapping[str, int]:
-        return self.intake.counts
-
-    @property
     def authenticator(self) -> Authenticator | None:
         """Makes the codes of messages, and checks them."""
         return self.intake.authenticator
@@ -228,11 +222,6 @@ class ZenohBus:
     def closed(self) -> bool:
         return self._closing.is_set()
 
-    @property
-    def session(self) -> zenoh.Session:
-        """The raw session, for measurements beside it."""
-        return self._session
-
     def __enter__(self) -> ZenohBus:
         return self
 
@@ -243,9 +232,9 @@ class ZenohBus:
         if self.closed:
             return
         below = topic.value(fields)[1]
-        key, payload = f"{self._namespace}/{below}", meant_for(below, encode(message))
+        key, payload = f"{self.namespace}/{below}", meant_for(below, encode(message))
         self.intake.sent(payload)
-        self._session.put(
+        self.session.put(
             key,
             payload,
             attachment=code_of(self.authenticator, key, payload),
@@ -301,11 +290,11 @@ class ZenohBus:
 
     def _pattern(self, topic: Topic, fields: Mapping[str, str | int]) -> str:
         """The key expression of a subscription or queryable."""
-        return patterned(topic.expression(self._namespace, **fields))
+        return patterned(topic.expression(self.namespace, **fields))
 
     def _subscriber(self, topic: Topic, fields: Mapping[str, str | int]) -> Any:
         expression = self._pattern(topic, fields)
-        subscriber = self._session.declare_subscriber(expression, zenoh.handlers.RingChannel(topic.buffer))
+        subscriber = self.session.declare_subscriber(expression, zenoh.handlers.RingChannel(topic.buffer))
         self._subscribers.setdefault(expression, []).append(subscriber)
         return subscriber
 
@@ -321,11 +310,11 @@ class ZenohBus:
             elif answerer.size > topic.ask_bytes:
                 answerer.decoded()  # which rejects it
             else:
-                asker = asker_in(topic.parse(self._namespace, str(query.key_expr)) or {})
+                asker = asker_in(topic.parse(self.namespace, str(query.key_expr)) or {})
                 post(Undecoded(topic, answerer, answerer.decoded, asker))
 
         expression = self._pattern(topic, fields)
-        queryable = self._session.declare_queryable(expression, _calling(enter))
+        queryable = self.session.declare_queryable(expression, _calling(enter))
         self._queryables.setdefault(expression, []).append(queryable)
         self._entities.append(queryable)
 
@@ -344,7 +333,7 @@ class ZenohBus:
     ) -> None:
         replies = 0
         failure: str | None = None
-        expression = topic.expression(self._namespace, **fields)
+        expression = topic.expression(self.namespace, **fields)
         asked = meant_for(self.intake.below(expression), encode(request))
         began_s = time.monotonic()
 
@@ -377,7 +366,7 @@ class ZenohBus:
             finish()
             return
         self.intake.sent(asked)
-        self._session.get(
+        self.session.get(
             f"{expression}?{TIMEOUT_PARAMETER}={timeout_s}",
             _calling(arrive, finish),
             target=zenoh.QueryTarget.ALL,
@@ -391,11 +380,11 @@ class ZenohBus:
     def declare_alive(self, peer: Peer) -> None:
         self._own_peers.append(peer)
         key = ALIVE_KEY.format(role=peer.role, id=peer.id, incarnation=peer.incarnation)
-        self._entities.append(self._session.liveliness().declare_token(f"{self._namespace}/{key}"))
+        self._entities.append(self.session.liveliness().declare_token(f"{self.namespace}/{key}"))
 
     def watch_alive(self, post: Post, role: str = "*") -> None:
         def arrive(sample: zenoh.Sample) -> None:
-            if not str(sample.key_expr).startswith(f"{self._namespace}/"):
+            if not str(sample.key_expr).startswith(f"{self.namespace}/"):
                 return
             try:
                 peer = peer_of(str(sample.key_expr))
@@ -407,8 +396,8 @@ class ZenohBus:
             post(Appeared(peer) if sample.kind == zenoh.SampleKind.PUT else Disappeared(peer))
 
         key = ALIVE_KEY.format(role=role, id="*", incarnation="*")
-        subscriber = self._session.liveliness().declare_subscriber(
-            patterned(f"{self._namespace}/{key}"), _calling(arrive), history=True
+        subscriber = self.session.liveliness().declare_subscriber(
+            patterned(f"{self.namespace}/{key}"), _calling(arrive), history=True
         )
         self._entities.append(subscriber)
 
@@ -416,7 +405,7 @@ class ZenohBus:
         def arrive(event: Any) -> None:
             post(LinkChanged(up=event.kind == zenoh.SampleKind.PUT))
 
-        listener = self._session.info.declare_transport_events_listener(_calling(arrive), history=False)
+        listener = self.session.info.declare_transport_events_listener(_calling(arrive), history=False)
         self._entities.append(listener)
 
     def close(self) -> None:
@@ -450,7 +439,7 @@ class ZenohBus:
         for thread in self._threads:
             thread.join(timeout=2.0)
         with contextlib.suppress(zenoh.ZError):  # the router hangs
-            self._session.close()  # type: ignore[no-untyped-call]
+            self.session.close()  # type: ignore[no-untyped-call]
 
     def _read(self, entity: Any, arrive: Callable[[Any], None], name: str, take: Callable[[], Any]) -> None:
         """Makes what `take` returns arrive, one after the other on a thread of its own, until the entity is

@@ -160,19 +160,15 @@ class BoundaryBus:
 
     def __init__(self, bus: Bus, crossing: Crossing) -> None:
         self._bus = bus
-        self.proves_names = bus.proves_names
+        self.namespace, self.proves_names = bus.namespace, bus.proves_names
         self._crossing = crossing
-
-    @property
-    def namespace(self) -> str:
-        return self._bus.namespace
 
     @property
     def counts(self) -> Mapping[str, int]:
         return self._crossing.read_as("counts of the bus", lambda: dict(self._bus.counts), dict[str, int])
 
     def publish(self, topic: Topic, message: Message, **fields: str | int) -> None:
-        self._crossing.let_out(f"put {topic.below(topic.one(fields))}", content_of(message), message)
+        self._crossing.let_out(f"put {topic.value(fields)[1]}", content_of(message), message)
         self._bus.publish(topic, message, **fields)
 
     def subscribe(self, topic: Topic, post: Post, *, every_s: float = 0.0, **fields: str | int) -> None:

@@ -254,7 +254,7 @@ class Inbox:
         with self._lock:
             self._next += 1
             self._queues.setdefault(_ASKED, OrderedDict())
-            price = bus.QUESTION_COST_BYTES + question.size
+            price = bus.QUESTION_COST_BYTES + question.answerer.size
             dropped = self._asked.put(asker, (self._next, question), price=price, rank=rank)
             self._unread += 1 - len(dropped)
             self.counts["events_dropped"] += len(dropped)

@@ -12,10 +12,11 @@ from pathlib import Path
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from support.dummy_roles import Idle
 from support.makers import run_info
 from support.swarm_model import LossyLinks
 
-from swarm.bus.bus import AskEnded, Event, LinkChanged
+from swarm.bus.bus import AskEnded, LinkChanged
 from swarm.bus.memory_bus import MemoryNetwork
 from swarm.bus.scheduler import Scheduler
 from swarm.clock import ManualClock, MonotonicClock
@@ -24,7 +25,7 @@ from swarm.runtime.inbox import Inbox
 from swarm.runtime.loop_health import Board, Health, Phase, Supervisor, Vitals, supervisor_of
 from swarm.runtime.membership import Member
 from swarm.runtime.process import Process
-from swarm.runtime.stats import READY, Counters
+from swarm.runtime.stats import READY
 from swarm.wire.topics import RUN
 
 
@@ -80,26 +81,20 @@ def test_nothing_was_written_where_there_are_zeros_or_rubbish() -> None:
     assert Board(bytearray(os.urandom(loop_health.BOARD_BYTES))).read() is None
 
 
-class Sleepy:
+class Sleepy(Idle):
     """A service whose tick hangs on request."""
 
     def __init__(self) -> None:
-        self.counters = Counters()
+        super().__init__()
         self.hang, self.wake = threading.Event(), threading.Event()
         self.needs: list[str] = ["a bed"]
 
     def lacks(self) -> list[str]:
         return self.needs
 
-    def start(self, now_ns: int) -> None: ...
-
-    def handle(self, event: Event, now_ns: int) -> None: ...
-
     def tick(self, now_ns: int) -> None:
         if self.hang.is_set():
             self.wake.wait(60)
-
-    def stop(self, now_ns: int) -> None: ...
 
 
 @contextlib.contextmanager
