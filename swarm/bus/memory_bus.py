@@ -53,7 +53,6 @@ class Asking:
     failure   the last refusal, or "timeout"
     asked     the question's payload
     over      whether `AskEnded` was posted: later replies are dropped
-    began_ns  when it was asked
     """
 
     bus: MemoryBus
@@ -62,15 +61,12 @@ class Asking:
     tag: str
     post: Post
     timeout_s: float
+    began_ns: int
     waiting: set[int] = field(default_factory=set)
     replies: int = 0
     failure: str | None = None
     asked: bytes = b""
     over: bool = False
-    began_ns: int = field(init=False)
-
-    def __post_init__(self) -> None:
-        self.began_ns = self.bus.network.scheduler.clock.now_ns()
 
     @property
     def took_s(self) -> float:
@@ -527,7 +523,7 @@ class MemoryBus:
             raise TypeError(f"topic {topic.name} is not a queryable")
         wanted = topic.every(fields)
         scheduler = self.network.scheduler
-        asking = Asking(self, topic, wanted, tag, post, timeout_s)
+        asking = Asking(self, topic, wanted, tag, post, timeout_s, scheduler.clock.now_ns())
         if self.closed:
             scheduler.after(0, asking.finish)
             return

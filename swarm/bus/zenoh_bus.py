@@ -39,7 +39,7 @@ from swarm.bus.bus import (
     check_subscription,
     meant_for,
 )
-from swarm.bus.endpoints import keeps_open, wait_for_router, why_not_listening, why_unreachable
+from swarm.bus.endpoints import keeps_open, wait_for_router, why_not_listening, why_silent
 from swarm.bus.zenoh_config import patterned, session_config
 from swarm.config.scenario import NetworkConfig
 from swarm.errors import BusError, ProtocolError
@@ -174,8 +174,8 @@ def _why_not(error: zenoh.ZError, network: NetworkConfig, mode: str) -> BusError
     log.info("zenoh says: %s", error)
     if mode == "router":
         return BusError(f"cannot listen on {', '.join(network.listen)}: {why_not_listening(error)}")
-    reason = why_unreachable(network.connect, encrypted=network.tls is not None)
-    return BusError(f"cannot reach a router at {', '.join(network.connect)}: {reason}")
+    reasons = dict.fromkeys(why_silent(endpoint, network.tls is not None) for endpoint in network.connect)
+    return BusError(f"cannot reach a router at {', '.join(network.connect)}: {'; '.join(reasons)}")
 
 
 class ZenohBus:
