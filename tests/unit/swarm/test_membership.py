@@ -100,10 +100,6 @@ def test_one_that_does_not_belong_ends_with_a_sentence_and_the_others_go_on(chan
     assert first.failure is None
 
 
-def test_a_process_that_does_not_say_its_wire_version_speaks_the_last_one_before_any_said_it():
-    assert INFO.wire_version == 8
-
-
 def test_a_router_that_answers_first_hides_no_other_run():
     router, foreign = (msgspec.structs.replace(INFO, **each) for each in (ROUTER, {"run_id": "r2"}))
     with pytest.raises(RunMismatchError, match="run r2"):
