@@ -402,14 +402,7 @@ class Bus(Protocol):
         ...
 
     def ask(
-        self,
-        topic: Topic,
-        request: Message,
-        post: Post,
-        *,
-        tag: str,
-        timeout_s: float = 2.0,
-        **fields: str | int,
+        self, topic: Topic, request: Message, post: Post, *, tag: str, timeout_s: float = 2.0, **fields: str | int
     ) -> None:
         """Queries all servers of the key, this process included. Posts `Replied` for each reply and then always one
         `AskEnded`, after `timeout_s` at the latest."""

@@ -510,14 +510,7 @@ class MemoryBus:
         self.queryables[topic.name] = [each for each in served if each.narrow != narrow]
 
     def ask(
-        self,
-        topic: Topic,
-        request: Message,
-        post: Post,
-        *,
-        tag: str,
-        timeout_s: float = 2.0,
-        **fields: str | int,
+        self, topic: Topic, request: Message, post: Post, *, tag: str, timeout_s: float = 2.0, **fields: str | int
     ) -> None:
         if topic.request is None:
             raise TypeError(f"topic {topic.name} is not a queryable")

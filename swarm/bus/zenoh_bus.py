@@ -322,14 +322,7 @@ class ZenohBus:
         self._undeclare_all(self._queryables.pop(self._pattern(topic, fields), ()))
 
     def ask(
-        self,
-        topic: Topic,
-        request: Message,
-        post: Post,
-        *,
-        tag: str,
-        timeout_s: float = 2.0,
-        **fields: str | int,
+        self, topic: Topic, request: Message, post: Post, *, tag: str, timeout_s: float = 2.0, **fields: str | int
     ) -> None:
         replies = 0
         failure: str | None = None

@@ -51,10 +51,7 @@ def load_scenario(path: Path) -> Scenario:
 
 
 def parse_scenario(
-    text: str,
-    source: str = "scenario",
-    base: Path | None = None,
-    settings: Mapping[str, Any] | None = None,
+    text: str, source: str = "scenario", base: Path | None = None, settings: Mapping[str, Any] | None = None
 ) -> Scenario:
     """Like `load_scenario`, but from a string. Relative paths in it are resolved against `base`, if given. `source`
     names the text in errors.
@@ -68,11 +65,7 @@ def parse_scenario(
 
 
 def read_scenario(
-    text: str,
-    source: str,
-    base: Path | None = None,
-    most: int = 50,
-    settings: Mapping[str, Any] | None = None,
+    text: str, source: str, base: Path | None = None, most: int = 50, settings: Mapping[str, Any] | None = None
 ) -> tuple[Scenario | None, list[str]]:
     """Returns the scenario of a text and its faults, up to a limit of sentences. A key that could not be read has
     its default; None if that is not enough.

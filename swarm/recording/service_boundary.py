@@ -222,14 +222,7 @@ class BoundaryBus:
         self._bus.unserve(topic, **fields)
 
     def ask(
-        self,
-        topic: Topic,
-        request: Message,
-        post: Post,
-        *,
-        tag: str,
-        timeout_s: float = 2.0,
-        **fields: str | int,
+        self, topic: Topic, request: Message, post: Post, *, tag: str, timeout_s: float = 2.0, **fields: str | int
     ) -> None:
         to = f"ask {topic.below(topic.every(fields))} {tag} timeout_s={timeout_s:g}"
         self._crossing.let_out(to, content_of(request), request)

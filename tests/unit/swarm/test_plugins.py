@@ -223,8 +223,7 @@ def test_an_alarm_leaves_that_of_others_as_it_was() -> None:
 
 
 @pytest.mark.parametrize(
-    "hangs",
-    ["return sum(repeat(0))", "while True:\n        with suppress(BaseException): time.sleep(30)"],
+    "hangs", ["return sum(repeat(0))", "while True:\n        with suppress(BaseException): time.sleep(30)"]
 )
 def test_a_call_that_no_alarm_ends_kills_the_process_and_leaves_its_line(hangs: str, tmp_path: Path) -> None:
     """Native code does not come back, and other code swallows the alarm."""
