@@ -88,11 +88,7 @@ def describe(terrain: Terrain, keeper: str) -> BaseMap:
         for layer in LAYERS
     }
     return BaseMap(
-        keeper=keeper,
-        terrain=terrain.digest,
-        **asdict(grid),
-        digests=digests,
-        notes=list(terrain.notes),
+        keeper=keeper, terrain=terrain.digest, **asdict(grid), digests=digests, notes=list(terrain.notes)
     )
 
 
@@ -126,9 +122,8 @@ class BaseMapServer:
         self._keeper = keeper
         self._packed = lru_cache(_PIECES_KEPT)(self._pack)
         self._inbox = Inbox()
-        self._thread: threading.Thread | None = None
-        self._starting = threading.Lock()
-        """Held to make the thread."""
+        self._starts = threading.Lock()
+        """Taken for good by the first question, which starts the thread."""
 
     def start(self, bus: Bus) -> None:
         """Serves the description, and pieces."""
@@ -140,16 +135,13 @@ class BaseMapServer:
         if isinstance(event, Asked):
             self._answer(event)
             return
-        with self._starting:
-            if self._thread is None:
-                self._thread = threading.Thread(target=self._work, name="base-map", daemon=True)
-                self._thread.start()
         self._inbox.post(event)
+        if self._starts.acquire(blocking=False):
+            threading.Thread(target=self._work, name="base-map", daemon=True).start()
 
     def _work(self) -> None:
         while True:
-            event = self._inbox.take(_LONGEST_WAIT_S)
-            if isinstance(event, Asked):
+            if isinstance(event := self._inbox.take(_LONGEST_WAIT_S), Asked):
                 self._answer(event)
 
     def _answer(self, event: Asked) -> None:
@@ -284,9 +276,8 @@ class BaseMapCopy:
             raise TerrainError(f"{self._who} has ground with no possible pace")
         if classes.max(initial=0) > max(TerrainClass):
             raise TerrainError(f"{self._who} has class {classes.max()}, at most {int(max(TerrainClass))} exists")
-        photo = self._arrays.get("photo")
-        if photo is None:
-            photo = np.broadcast_to(np.uint8(0), (*classes.shape, 3))  # black: it is not shown
+        black = np.broadcast_to(np.uint8(0), (*classes.shape, 3))  # it is not shown
+        photo = self._arrays.get("photo", black)
         notes = (*self.notes, f"fetched from keeper {self.keeper}, as its files are not on this machine")
         made = finished(self.grid, elevation, photo, classes, ground, cost, notes)
         if made.digest != self._terrain:
