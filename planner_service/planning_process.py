@@ -169,7 +169,7 @@ class PlanningProcess(MemberService):
         self._maps = ClassMaps(cost_map, class_terrains(scenario, terrain), class_numbers(scenario))
         self._cost_maps = {GROUND: cost_map} | self._maps.of
         self._replica = MapReplica(terrain.grid, self._maps, filter=self._mark_filter)
-        self._sync = MapSync(self._replica, bus, post, scenario.map, setup.role, at_ticks=True)
+        self._sync = MapSync(self._replica, bus, post, scenario.map, setup.role)
         self._learned = LearnedGauges(cost_map.keys, self.counters)
         self._order_client = OrderClient(setup, bus, post, self._obeys)
         self._leads = False
@@ -220,7 +220,7 @@ class PlanningProcess(MemberService):
         self._leads = leads
         for topic, fields in self._served_topics.items():
             if leads:
-                self._bus.serve(topic, self._post, undecoded=True, **fields)
+                self._bus.serve(topic, self._post, **fields)
             else:
                 self._bus.unserve(topic, **fields)
         self._candidacy.tell(self._member, now_ns)

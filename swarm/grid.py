@@ -227,10 +227,7 @@ class GridSpec:
         """The window of `half` cells to each side of a cell, clipped to the grid. Raises OutsideGridError."""
         row, col = self.row_col(cell)
         return Window(
-            max(row - half, 0),
-            max(col - half, 0),
-            min(row + half + 1, self.rows),
-            min(col + half + 1, self.cols),
+            max(row - half, 0), max(col - half, 0), min(row + half + 1, self.rows), min(col + half + 1, self.cols)
         )
 
     def neighbours(self, cell: int) -> Iterator[tuple[int, int]]:

@@ -90,7 +90,7 @@ class AgentParts:
         reads = MarkFilter(grid, readable_groups(scenario, group))
         self.replica = MapReplica(grid, self.maps.sink, author=self.author, group=group, filter=reads)
         near = scenario.map.interest == "near"
-        self.sync = MapSync(self.replica, bus, post, scenario.map, setup.role, near=near, at_ticks=True)
+        self.sync = MapSync(self.replica, bus, post, scenario.map, setup.role, near=near)
         self.zones = ZonesAround(self.replica, self.maps)
         lead_cells = max(scenario.vehicles.reserve_cells, FAR_CELLS) + FAR_CELLS + _LEAD_CELLS
         # Wherever a vehicle writes marks, its agent has to know what others say of the same cells.

@@ -95,7 +95,7 @@ class MonitorService(MemberService):
         self._member.web_port = web_port
         cost_map = CostMap(terrain, learning=scenario.map.learning)
         replica = MapReplica(terrain.grid, cost_map)
-        self._sync = MapSync(replica, bus, post, scenario.map, setup.role, at_ticks=True)
+        self._sync = MapSync(replica, bus, post, scenario.map, setup.role)
         self._panel = live_layout.FiguresPanel(scene.pen, scenario.target_ids)
         self._movers = MoversView(scene.pen, scenario, self.observed, self.counters, replica.filter)
         self._ground = GroundView(scene, terrain, cost_map, replica, scenario, self._movers.looks.legend())

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import logging
+import threading
 import time
 import zlib
 from collections.abc import Iterator
@@ -25,6 +26,7 @@ from swarm.bus.bus import Asked, Bus, Event
 from swarm.config.ground import CostConfig
 from swarm.errors import ProtocolError, TerrainError
 from swarm.grid import REGION_CELLS, GridSpec, Window
+from swarm.runtime.inbox import Inbox
 from swarm.runtime.operator import replies_to
 from swarm.wire.messages import Nothing
 from swarm.wire.messages.map_data import BASE_DIGEST_BYTES, BaseMap, BaseMapRequest, BaseMapTile
@@ -52,6 +54,7 @@ LAYERS = {
 }
 _PIECES_KEPT = 1024
 """Packed pieces that a keeper keeps, at most 64 MiB: machines often start together."""
+_LONGEST_WAIT_S = 3600.0
 _PIECES_PER_REQUEST = 64
 """Pieces of at most 64 KiB each: the largest cost of one reply to a keeper."""
 
@@ -85,11 +88,7 @@ def describe(terrain: Terrain, keeper: str) -> BaseMap:
         for layer in LAYERS
     }
     return BaseMap(
-        keeper=keeper,
-        terrain=terrain.digest,
-        **asdict(grid),
-        digests=digests,
-        notes=list(terrain.notes),
+        keeper=keeper, terrain=terrain.digest, **asdict(grid), digests=digests, notes=list(terrain.notes)
     )
 
 
@@ -115,33 +114,43 @@ def pack(terrain: Terrain, layer: str, region: int) -> BaseMapTile:
 
 
 class BaseMapServer:
-    """Answers for a terrain, which never changes: so on the bus's own thread, beside the keeper's loop, which a
+    """Answers for a terrain, which never changes: so on a thread of its own, beside the keeper's loop, which a
     large map must not hold up. Pieces are packed once and kept."""
 
     def __init__(self, terrain: Terrain, keeper: str) -> None:
         self._terrain = terrain
         self._keeper = keeper
         self._packed = lru_cache(_PIECES_KEPT)(self._pack)
+        self._inbox = Inbox()
+        self._starts = threading.Lock()
+        """Taken for good by the first question, which starts the thread."""
 
     def start(self, bus: Bus) -> None:
         """Serves the description, and pieces."""
-        bus.serve(BASE_MAP, self.answer_map, keeper=self._keeper)
-        bus.serve(BASE_TILES, self.answer_tiles, keeper=self._keeper)
+        bus.serve(BASE_MAP, self._post, keeper=self._keeper)
+        bus.serve(BASE_TILES, self._post, keeper=self._keeper)
 
-    def answer_map(self, event: Event) -> None:
-        """Replies with the description of the terrain."""
-        assert isinstance(event, Asked)
-        event.answer(self._described)
-        event.end()
+    def _post(self, event: Event) -> None:
+        """Leaves a question to the thread; one of a simulated network, which comes decoded, is answered at once."""
+        if isinstance(event, Asked):
+            self._answer(event)
+            return
+        self._inbox.post(event)
+        if self._starts.acquire(blocking=False):
+            threading.Thread(target=self._work, name="base-map", daemon=True).start()
 
-    def answer_tiles(self, event: Event) -> None:
-        """Replies with the requested pieces, or refuses with the reason."""
-        assert isinstance(event, Asked)
+    def _work(self) -> None:
+        while True:
+            if isinstance(event := self._inbox.take(_LONGEST_WAIT_S), Asked):
+                self._answer(event)
+
+    def _answer(self, event: Asked) -> None:
+        """Replies with the description of the terrain or the requested pieces, or refuses with the reason."""
         request = event.request
-        assert isinstance(request, BaseMapRequest)
         regions = self._terrain.grid.regions
-        unknown = [layer for layer in request.layers if layer not in LAYERS]
-        if unknown:
+        if not isinstance(request, BaseMapRequest):
+            event.answer(self._described)
+        elif unknown := [layer for layer in request.layers if layer not in LAYERS]:
             event.refuse(f"there is no layer {unknown[0][:40]!r}; there are {', '.join(LAYERS)}")
         elif len(request.layers) * len(request.regions) > _PIECES_PER_REQUEST:
             event.refuse(f"at most {_PIECES_PER_REQUEST} pieces in one request")
@@ -267,9 +276,8 @@ class BaseMapCopy:
             raise TerrainError(f"{self._who} has ground with no possible pace")
         if classes.max(initial=0) > max(TerrainClass):
             raise TerrainError(f"{self._who} has class {classes.max()}, at most {int(max(TerrainClass))} exists")
-        photo = self._arrays.get("photo")
-        if photo is None:
-            photo = np.broadcast_to(np.uint8(0), (*classes.shape, 3))  # black: it is not shown
+        black = np.broadcast_to(np.uint8(0), (*classes.shape, 3))  # it is not shown
+        photo = self._arrays.get("photo", black)
         notes = (*self.notes, f"fetched from keeper {self.keeper}, as its files are not on this machine")
         made = finished(self.grid, elevation, photo, classes, ground, cost, notes)
         if made.digest != self._terrain:

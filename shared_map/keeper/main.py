@@ -20,12 +20,7 @@ TICK_HZ = 10.0
 """Marks wait a tenth of a second for the disk at most, and one commit takes in what came meanwhile."""
 
 
-def run(
-    setup: RoleSetup,
-    built: Callable[[], None],
-    store_path: Path | None = None,
-    rebuild: bool = False,
-) -> None:
+def run(setup: RoleSetup, built: Callable[[], None], store_path: Path | None = None, rebuild: bool = False) -> None:
     """Keeps the map until told to stop.
 
     store_path  the SQLite file; if not given, `map.sqlite` in the run's folder (`map-ID.sqlite` of a keeper whose

@@ -107,8 +107,7 @@ class KeeperService(MemberService):
             on_accepted=self._accepted,
             on_digest=lambda author, now_ns: self._plan.note_alive(author, now_ns),
         )
-        config = setup.scenario.map
-        self._compact_after_ns = int(config.compact_after_s * NS_PER_S)
+        self._compact_after_ns = int(setup.scenario.map.compact_after_s * NS_PER_S)
         self._plan = CompactionPlan(self._compact_after_ns, 0)
         self._compact_due_ns = 0
         for name in ("sets_saved", "saves_failed", "sets_folded", "sets_refused", "marks_merged", "orders_refused"):
@@ -165,6 +164,7 @@ class KeeperService(MemberService):
     def tick(self, now_ns: int) -> None:
         while self._zones_held and self._can_draw():
             self._order_zone(*self._zones_held.pop(0), now_ns)
+        self._sync.take_in(now_ns)
         if now_ns >= self._save_due_ns:
             self._save(now_ns)
         if now_ns >= self._compact_due_ns and not self._keeper.waiting:
@@ -175,14 +175,13 @@ class KeeperService(MemberService):
         self._sync.tick(now_ns)
         self._orders.tick(now_ns)
         self._name_throttled(now_ns)
-        counts = self.replica.counts
-        self.counters.counts["marks_merged"] = counts["marks_merged"]
-        for name in ("sets_refused", "sets_without_room"):
-            self.counters.counts[name] = counts[name]
+        for name in ("marks_merged", "sets_refused", "sets_without_room"):
+            self.counters.counts[name] = self.replica.counts[name]
         self.counters.gauge("sets_waiting", float(self._keeper.waiting))
         self._member.tick(now_ns)
 
     def stop(self, now_ns: int) -> None:
+        self._sync.take_in(now_ns)
         self._save(now_ns)
         self._member.publish_stats(now_ns)
 

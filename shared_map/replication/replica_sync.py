@@ -18,10 +18,10 @@ from shared_map.replication.interest import DigestInterest
 from shared_map.replication.marks import packed, unpacked
 from shared_map.replication.replica import MapReplica, Merged
 from shared_map.replication.tiles import beyond_region, beyond_tile, of_all_classes, region_of, region_tiles
-from swarm.bus.bus import Asked, AskEnded, Bus, Event, HeardMany, LinkChanged, Post, Replied
+from swarm.bus.bus import Asked, AskEnded, Bus, Event, LinkChanged, Post, Replied
 from swarm.clock import NS_PER_S
 from swarm.config.scenario import MapConfig
-from swarm.wire.messages import Message, map_data
+from swarm.wire.messages import map_data
 from swarm.wire.topics import DIGEST, MARKS
 
 log = logging.getLogger(__name__)
@@ -83,8 +83,6 @@ class MapSync:
     on_digest    called with the author of every received digest, and the time of its arrival
     near         hold only regions that `enter` names, instead of the whole map, and hear only the digests that
                  can matter there (`DigestInterest`)
-    at_ticks     merge received sets at the next tick, all together, without waking a thread: for a service that
-                 uses the map at ticks only
     joined       True once the initial request for existing marks is over: a reply came, or all attempts failed
     """
 
@@ -102,7 +100,6 @@ class MapSync:
         on_accepted: Callable[[map_data.MarkSet], None] = lambda mark_set: None,
         on_digest: Callable[[str, int], None] = lambda author, now_ns: None,
         near: bool = False,
-        at_ticks: bool = False,
     ) -> None:
         self.replica = replica
         self.joined = False
@@ -119,7 +116,6 @@ class MapSync:
         self._warned_ns: dict[str, int] = {}  # author -> when a warning named it last
         self._join_due_ns: int | None = None  # ask again then
         self._join_tries = 0
-        self._at_ticks = at_ticks
         self._digest_ns = int(config.digest_s * NS_PER_S)
         self._digest_due_ns = 0
         self._changes_due_ns = 0
@@ -143,7 +139,7 @@ class MapSync:
     def start(self, now_ns: int) -> None:
         """Subscribes, serves, and requests all earlier statements."""
         if self._regions is None:
-            self._listen()
+            self._bus.collect(MARKS)
             self._join()
         self._bus.collect(DIGEST)
         self._digest_interest.start(now_ns)
@@ -161,9 +157,9 @@ class MapSync:
         self._regions = regions
         new, grid = sorted(regions - before), self.replica.grid
         if not before:
-            self._listen(region=beyond_region(grid))
+            self._bus.collect(MARKS, region=beyond_region(grid))
         for region in new:
-            self._listen(region=region)
+            self._bus.collect(MARKS, region=region)
         for region in sorted(before - regions):
             self._bus.unsubscribe(MARKS, region=region)
         self.replica.limit_to(regions)
@@ -174,17 +170,9 @@ class MapSync:
             request = map_data.MarksRequest(tiles=tiles[first : first + _TILES_AT_ONCE], bulk=True)
             self._bus.ask(MARKS, request, self._post, tag=_ENTER)
 
-    def _listen(self, **fields: int) -> None:
-        if self._at_ticks:
-            self._bus.collect(MARKS, **fields)
-        else:
-            self._bus.subscribe(MARKS, self._post, together=True, **fields)
-
     def on_map_event(self, event: Event, now_ns: int) -> bool:
         """True if the event concerns the map only, so that no other part needs to handle it."""
         match event:
-            case HeardMany(topic=topic, samples=samples) if topic is MARKS:
-                self._receive(samples, now_ns)
             case Replied(tag=tag, topic=topic) if topic is MARKS and tag in (_JOIN, _ENTER):
                 self._merge(self._sets_in(event), measured=False)
             case Replied(tag=tag, topic=topic) if topic is MARKS and tag.startswith(_RESYNC):
@@ -214,7 +202,7 @@ class MapSync:
             self._receive_digest(digest.message, now_ns)
         self._answers_left = _ANSWERS_PER_TICK
         self._answer_some()
-        self._take_in(now_ns)
+        self.take_in(now_ns)
         self._merge_waiting(now_ns)
         self._choose_digests(now_ns)
         self.publish(self.replica.tick(now_ns))
@@ -233,7 +221,7 @@ class MapSync:
     def holds(self, author: str, rows: bytes, now_ns: int) -> bool:
         """Returns True if the map has the sets that these rows of a digest name, as far as they are of interest
         here and have not expired by our clock. Missing sets are requested."""
-        self._take_in(now_ns)
+        self.take_in(now_ns)
         lacking = self.replica.lacking(author, rows)
         if lacking:
             self._fetch(author, lacking, now_ns)
@@ -252,13 +240,12 @@ class MapSync:
         region = region_of(self.replica.grid, mark_set.tile)
         self._bus.publish(MARKS, mark_set, region=region, tile=mark_set.tile, author=mark_set.author)
 
-    def _take_in(self, now_ns: int) -> None:
-        """Merges what others put since the last tick."""
-        if self._at_ticks and (samples := self._bus.collected_together(MARKS)):
-            self._receive(samples, now_ns)
-
-    def _receive(self, samples: Sequence[tuple[str, Message]], now_ns: int) -> None:
-        """Sets that were put, each under the key of its tile and author: access is granted by key."""
+    def take_in(self, now_ns: int) -> None:
+        """Merges what others put since the last tick, each set under the key of its tile and author: access is
+        granted by key."""
+        samples = self._bus.collected_together(MARKS)
+        if not samples:
+            return
         sets = [
             each for key, each in samples
             if isinstance(each, map_data.MarkSet) and key.endswith(f"/{each.tile}/{each.author}")

@@ -32,7 +32,7 @@ from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass, field
 from functools import lru_cache
 from typing import Protocol, TypeVar
@@ -141,17 +141,6 @@ class Heard:
     message: Message
 
 
-@dataclass(frozen=True, slots=True)
-class HeardMany:
-    """Samples that waited together on a topic subscribed to with `together`, in the order of their arrival.
-
-    samples  (key below the namespace, message); the key is not yet compared with the message
-    """
-
-    topic: Topic
-    samples: Sequence[tuple[str, Message]]
-
-
 class Question:
     """A query on a topic that we serve, decoded or not. It waits until `end` is called."""
 
@@ -160,11 +149,6 @@ class Question:
     answerer: Answerer
     asker: str
     """Name of the asker, as its key says; "" if the key names none."""
-
-    @property
-    def size(self) -> int:
-        """Bytes of the request, as it came."""
-        return self.answerer.size
 
     @property
     def timeout_s(self) -> float:
@@ -298,7 +282,7 @@ class WorkDone:
     took_ns: int
 
 
-Event = Heard | HeardMany | Asked | Undecoded | Replied | AskEnded | Appeared | Disappeared | LinkChanged | WorkDone
+Event = Heard | Asked | Undecoded | Replied | AskEnded | Appeared | Disappeared | LinkChanged | WorkDone
 Post = Callable[[Event], None]
 
 
@@ -309,7 +293,9 @@ class Answerer(Protocol):
     def timeout_s(self) -> float: ...
 
     @property
-    def size(self) -> int: ...
+    def size(self) -> int:
+        """Bytes of the request, as it came."""
+        ...
 
     def waited_s(self) -> float: ...
     def answer(self, message: Message, fields: Mapping[str, str | int]) -> None: ...
@@ -317,9 +303,9 @@ class Answerer(Protocol):
     def end(self) -> None: ...
 
 
-def check_subscription(topic: Topic, together: bool, every_s: float) -> None:
+def check_subscription(topic: Topic, every_s: float) -> None:
     """Raises TypeError on a subscription that the topic does not allow."""
-    if every_s and (together or not topic.newest):
+    if every_s and not topic.newest:
         raise TypeError(f"topic {topic.name} cannot be sampled: each of its messages counts")
 
 
@@ -354,15 +340,12 @@ def counter_of(error: ProtocolError) -> str:
 class Bus(Protocol):
     """The network of one process. Keyword `fields` fill the topic's key; those not given are wildcards.
 
+    namespace     the first chunk of all keys
     proves_names  certificates prove who sends a message under a key that bears the sender's name
     """
 
+    namespace: str
     proves_names: bool
-
-    @property
-    def namespace(self) -> str:
-        """The first chunk of all keys."""
-        ...
 
     @property
     def counts(self) -> Mapping[str, int]:
@@ -374,16 +357,12 @@ class Bus(Protocol):
         process hears its own samples. Nothing is sent after `close`."""
         ...
 
-    def subscribe(
-        self, topic: Topic, post: Post, *, together: bool = False, every_s: float = 0.0, **fields: str | int
-    ) -> None:
+    def subscribe(self, topic: Topic, post: Post, *, every_s: float = 0.0, **fields: str | int) -> None:
         """Posts `Heard` for every sample from now on.
 
-        together  post `HeardMany` of all samples that wait, for a topic of many small messages; the reader
-                  compares each key with its message
-        every_s   post the newest sample of each key only, once per this interval (s): for a reader that is slower
-                  than the topic. Samples that it does not read are not decoded. Only for topics of which the newest
-                  counts
+        every_s  post the newest sample of each key only, once per this interval (s): for a reader that is slower
+                 than the topic. Samples that it does not read are not decoded. Only for topics of which the newest
+                 counts
         """
         ...
 
@@ -403,8 +382,8 @@ class Bus(Protocol):
         ...
 
     def collected_together(self, topic: Topic) -> list[tuple[str, Message]]:
-        """Returns all samples gathered on a topic since the last call, in order, with keys as in a `HeardMany`: for
-        a topic with many small messages. The reader compares each key with its message."""
+        """Returns (key below the namespace, message) of all samples gathered on a topic since the last call, in
+        order: for a topic with many small messages. The reader compares each key with its message."""
         ...
 
     def unsubscribe(self, topic: Topic, **fields: str | int) -> None:
@@ -412,11 +391,9 @@ class Bus(Protocol):
         under way may be posted after it."""
         ...
 
-    def serve(self, topic: Topic, post: Post, *, undecoded: bool = False, **fields: str | int) -> None:
-        """Posts `Asked` for every query on the key. Raises TypeError on a topic without requests.
-
-        undecoded  `post` is an inbox's, and may be given `Undecoded`: no thread has to wake up only to decode it
-        """
+    def serve(self, topic: Topic, post: Post, **fields: str | int) -> None:
+        """Posts every query on the key: as `Asked`, or `Undecoded`, so that no thread has to wake up only to decode
+        it. Raises TypeError on a topic without requests."""
         ...
 
     def unserve(self, topic: Topic, **fields: str | int) -> None:
@@ -425,14 +402,7 @@ class Bus(Protocol):
         ...
 
     def ask(
-        self,
-        topic: Topic,
-        request: Message,
-        post: Post,
-        *,
-        tag: str,
-        timeout_s: float = 2.0,
-        **fields: str | int,
+        self, topic: Topic, request: Message, post: Post, *, tag: str, timeout_s: float = 2.0, **fields: str | int
     ) -> None:
         """Queries all servers of the key, this process included. Posts `Replied` for each reply and then always one
         `AskEnded`, after `timeout_s` at the latest."""

@@ -70,12 +70,6 @@ def wait_for_router(endpoints: Sequence[str]) -> None:
         log.info("a router is there")
 
 
-def why_unreachable(endpoints: Sequence[str], *, encrypted: bool) -> str:
-    """Returns the reason why no router is reached at these endpoints, from a connection attempt to each port."""
-    reasons = dict.fromkeys(_why_silent(endpoint, encrypted) for endpoint in endpoints)
-    return "; ".join(reasons)
-
-
 def why_not_listening(error: Exception) -> str:
     """Returns the reason why no process can listen there, from the library's message."""
     found = _OS_ERROR.search(str(error))
@@ -86,7 +80,8 @@ def why_not_listening(error: Exception) -> str:
     return os.strerror(number) + (f" ({hint})" if hint else "")
 
 
-def _why_silent(endpoint: str, encrypted: bool) -> str:
+def why_silent(endpoint: str, encrypted: bool) -> str:
+    """Returns the reason why no router is reached at an endpoint, from a connection attempt to its port."""
     try:
         host, port = host_port(endpoint)
         socket.create_connection((host, port), timeout=_KNOCK_S).close()

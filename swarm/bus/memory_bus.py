@@ -22,7 +22,6 @@ from swarm.bus.bus import (
     Disappeared,
     Event,
     Heard,
-    HeardMany,
     LinkChanged,
     Post,
     Replied,
@@ -54,7 +53,6 @@ class Asking:
     failure   the last refusal, or "timeout"
     asked     the question's payload
     over      whether `AskEnded` was posted: later replies are dropped
-    began_ns  when it was asked
     """
 
     bus: MemoryBus
@@ -63,15 +61,12 @@ class Asking:
     tag: str
     post: Post
     timeout_s: float
+    began_ns: int
     waiting: set[int] = field(default_factory=set)
     replies: int = 0
     failure: str | None = None
     asked: bytes = b""
     over: bool = False
-    began_ns: int = field(init=False)
-
-    def __post_init__(self) -> None:
-        self.began_ns = self.bus.network.scheduler.clock.now_ns()
 
     @property
     def took_s(self) -> float:
@@ -121,10 +116,9 @@ class MemoryAnswerer:
         if self.ended:
             raise RuntimeError("answered after the end")
         asking, bus = self.asking, self.queryable.bus
-        named = asking.topic.one({**self.queryable.narrow, **fields})
+        named, key = asking.topic.value({**self.queryable.narrow, **fields})
         if bus.closed or any(chunk not in (named[name], "*") for name, chunk in asking.wanted.items()):
             return
-        key = asking.topic.below(named)
         payload = meant_for(key, encode(message))
         bus.sent(payload)
         code = code_of(bus.authenticator, key, payload, asking.asked)
@@ -190,14 +184,12 @@ class Declaration:
     prefix    its key expression up to the first wildcard
     narrow    the fields of its key that are no wildcard
     post      a subscription without one keeps its samples until they are collected
-    together  it posts a `HeardMany` of each sample: in a simulation nothing waits, so each comes alone
     """
 
     bus: MemoryBus
     prefix: str
     narrow: dict[str, str]
     post: Post | None
-    together: bool = False
 
     def meets(self, fields: Mapping[str, str]) -> bool:
         """Returns True if this and another key of the topic, with or without wildcards, can name the same value."""
@@ -207,12 +199,10 @@ class Declaration:
         return True
 
 
-def declared(
-    bus: MemoryBus, topic: Topic, fields: Mapping[str, str | int], post: Post | None, together: bool = False
-) -> Declaration:
+def declared(bus: MemoryBus, topic: Topic, fields: Mapping[str, str | int], post: Post | None) -> Declaration:
     """A subscription or queryable with these fields. Raises as `narrowed`."""
     prefix = topic.below(topic.every(fields)).partition("*")[0]
-    return Declaration(bus, prefix, narrowed(topic, fields), post, together)
+    return Declaration(bus, prefix, narrowed(topic, fields), post)
 
 
 def narrowed(topic: Topic, fields: Mapping[str, str | int]) -> dict[str, str]:
@@ -461,13 +451,11 @@ class MemoryBus:
         found = ((topic, topic.parse(self.namespace, f"{self.namespace}/{key}")) for topic in TOPICS)
         return [(topic, fields) for topic, fields in found if fields is not None]
 
-    def subscribe(
-        self, topic: Topic, post: Post, *, together: bool = False, every_s: float = 0.0, **fields: str | int
-    ) -> None:
-        check_subscription(topic, together, every_s)
+    def subscribe(self, topic: Topic, post: Post, *, every_s: float = 0.0, **fields: str | int) -> None:
+        check_subscription(topic, every_s)
         if every_s:
             post = sampled(self, post, int(every_s * NS_PER_S))
-        self._declare(topic, declared(self, topic, fields, post, together))
+        self._declare(topic, declared(self, topic, fields, post))
 
     def collect(self, topic: Topic, **fields: str | int) -> None:
         self._declare(topic, declared(self, topic, fields, None))
@@ -494,8 +482,8 @@ class MemoryBus:
         topic, post = sample.topic, subscription.post
         if post is None:
             self._kept.setdefault(topic.name, deque(maxlen=topic.buffer)).append(sample)
-        elif (event := self._event_of(sample, subscription.together)) is not None:
-            post(HeardMany(topic, [(sample.key, event.message)]) if subscription.together else event)
+        elif (event := self._event_of(sample)) is not None:
+            post(event)
 
     def _event_of(self, sample: _Sample, together: bool = False) -> Heard | None:
         """The event of a sample. One that is rejected is counted and dropped.
@@ -511,7 +499,7 @@ class MemoryBus:
     def unsubscribe(self, topic: Topic, **fields: str | int) -> None:
         self.network.subscriptions[self.namespace, topic.name].remove(self, narrowed(topic, fields))
 
-    def serve(self, topic: Topic, post: Post, *, undecoded: bool = False, **fields: str | int) -> None:
+    def serve(self, topic: Topic, post: Post, **fields: str | int) -> None:
         if topic.request is None:
             raise TypeError(f"topic {topic.name} is not a queryable")
         self.queryables.setdefault(topic.name, []).append(declared(self, topic, fields, post))
@@ -522,20 +510,13 @@ class MemoryBus:
         self.queryables[topic.name] = [each for each in served if each.narrow != narrow]
 
     def ask(
-        self,
-        topic: Topic,
-        request: Message,
-        post: Post,
-        *,
-        tag: str,
-        timeout_s: float = 2.0,
-        **fields: str | int,
+        self, topic: Topic, request: Message, post: Post, *, tag: str, timeout_s: float = 2.0, **fields: str | int
     ) -> None:
         if topic.request is None:
             raise TypeError(f"topic {topic.name} is not a queryable")
         wanted = topic.every(fields)
         scheduler = self.network.scheduler
-        asking = Asking(self, topic, wanted, tag, post, timeout_s)
+        asking = Asking(self, topic, wanted, tag, post, timeout_s, scheduler.clock.now_ns())
         if self.closed:
             scheduler.after(0, asking.finish)
             return

@@ -1,11 +1,10 @@
 """The bus of real processes, on one Zenoh session.
 
-Each subscription and queryable has a thread that reads its channel. The exception is a queryable whose queries are
-decoded by an inbox: those are posted on Zenoh's own thread (docs/design/zenoh-topology-and-inboxes.md). Three other
-choices rest on measurements. Subscriptions have channels that drop their oldest sample when full: with a FIFO a
-stalled reader holds up queries on the same link. Replies are posted on Zenoh's own thread: a thread per query is
-ten times slower. Queries, tokens and links are rare and have no channel of Zenoh's: a thread that waits on one
-wakes ten times a second for nothing (`Arrivals`)."""
+Each subscription that is not collected has a thread that reads its channel; all else is posted on Zenoh's own
+threads, queries undecoded (docs/design/zenoh-topology-and-inboxes.md). Three choices rest on measurements.
+Subscriptions have channels that drop their oldest sample when full: with a FIFO a stalled reader holds up queries
+on the same link. A thread per query for its replies is ten times slower. Queries, tokens and links are rare: a
+thread that waits for them on a channel of Zenoh's wakes ten times a second for nothing."""
 
 from __future__ import annotations
 
@@ -24,8 +23,6 @@ import zenoh
 
 from swarm.bus import zenoh_intake
 from swarm.bus.bus import (
-    QUESTION_BYTES,
-    QUESTION_COST_BYTES,
     TIMEOUT_PARAMETER,
     USUAL_TIMEOUT_S,
     Appeared,
@@ -33,7 +30,6 @@ from swarm.bus.bus import (
     AskEnded,
     Disappeared,
     Heard,
-    HeardMany,
     LinkChanged,
     Post,
     Replied,
@@ -43,7 +39,7 @@ from swarm.bus.bus import (
     check_subscription,
     meant_for,
 )
-from swarm.bus.endpoints import keeps_open, wait_for_router, why_not_listening, why_unreachable
+from swarm.bus.endpoints import keeps_open, wait_for_router, why_not_listening, why_silent
 from swarm.bus.zenoh_config import patterned, session_config
 from swarm.config.scenario import NetworkConfig
 from swarm.errors import BusError, ProtocolError
@@ -137,8 +133,6 @@ _PRIORITIES = {
     Priority.DATA: zenoh.Priority.DATA,
     Priority.BACKGROUND: zenoh.Priority.BACKGROUND,
 }
-_TOKEN_BUFFER = 65_536
-"""Changes of tokens, or of links, that wait to be read: more than processes can start in a second."""
 _CLOSE_S = 3.0
 """Time for which `close` waits for an unresponsive router (s)."""
 
@@ -180,8 +174,8 @@ def _why_not(error: zenoh.ZError, network: NetworkConfig, mode: str) -> BusError
     log.info("zenoh says: %s", error)
     if mode == "router":
         return BusError(f"cannot listen on {', '.join(network.listen)}: {why_not_listening(error)}")
-    reason = why_unreachable(network.connect, encrypted=network.tls is not None)
-    return BusError(f"cannot reach a router at {', '.join(network.connect)}: {reason}")
+    reasons = dict.fromkeys(why_silent(endpoint, network.tls is not None) for endpoint in network.connect)
+    return BusError(f"cannot reach a router at {', '.join(network.connect)}: {'; '.join(reasons)}")
 
 
 class ZenohBus:
@@ -193,10 +187,12 @@ class ZenohBus:
     """
 
     def __init__(self, session: zenoh.Session, namespace: str, authenticator: Authenticator | None = None) -> None:
-        self._session = session
+        self.session = session
+        """The raw session, also for measurements beside the bus."""
         self.proves_names = False
-        self._namespace = namespace
+        self.namespace = namespace
         self.intake = zenoh_intake.Intake(namespace, authenticator)
+        self.counts = self.intake.counts
         self._own_peers: list[Peer] = []
         """Our tokens, of which `watch_alive` does not tell."""
         self._entities: list[Any] = []
@@ -214,14 +210,6 @@ class ZenohBus:
         atexit.register(self.close)
 
     @property
-    def namespace(self) -> str:
-        return self._namespace
-
-    @property
-    def counts(self) -> Mapping[str, int]:
-        return self.intake.counts
-
-    @property
     def authenticator(self) -> Authenticator | None:
         """Makes the codes of messages, and checks them."""
         return self.intake.authenticator
@@ -234,11 +222,6 @@ class ZenohBus:
     def closed(self) -> bool:
         return self._closing.is_set()
 
-    @property
-    def session(self) -> zenoh.Session:
-        """The raw session, for measurements beside it."""
-        return self._session
-
     def __enter__(self) -> ZenohBus:
         return self
 
@@ -249,9 +232,9 @@ class ZenohBus:
         if self.closed:
             return
         below = topic.value(fields)[1]
-        key, payload = f"{self._namespace}/{below}", meant_for(below, encode(message))
+        key, payload = f"{self.namespace}/{below}", meant_for(below, encode(message))
         self.intake.sent(payload)
-        self._session.put(
+        self.session.put(
             key,
             payload,
             attachment=code_of(self.authenticator, key, payload),
@@ -260,15 +243,8 @@ class ZenohBus:
             allowed_destination=zenoh.Locality.ANY if topic.echoed else zenoh.Locality.REMOTE,
         )
 
-    def subscribe(
-        self, topic: Topic, post: Post, *, together: bool = False, every_s: float = 0.0, **fields: str | int
-    ) -> None:
-        check_subscription(topic, together, every_s)
-
-        def arrive_together(samples: list[zenoh.Sample]) -> None:
-            heard = self.intake.together(topic, samples)
-            if heard:
-                post(HeardMany(topic, heard))
+    def subscribe(self, topic: Topic, post: Post, *, every_s: float = 0.0, **fields: str | int) -> None:
+        check_subscription(topic, every_s)
 
         def arrive(samples: list[zenoh.Sample]) -> None:
             for heard in self.intake.newest(topic, samples):
@@ -276,13 +252,8 @@ class ZenohBus:
 
         subscriber = self._subscriber(topic, fields)
         channel = subscriber.handler  # a thread that waits on the subscriber itself keeps it from being undeclared
-        name = f"sub-{topic.name}"
-        if together:
-            self._read(subscriber, arrive_together, name, partial(zenoh_intake.waiting_in, channel))
-        elif every_s:
-            self._read(subscriber, arrive, name, partial(zenoh_intake.taken_after, channel, self._closing, every_s))
-        else:
-            self._read(subscriber, arrive, name, lambda: [channel.recv()])
+        take = partial(zenoh_intake.taken_after, channel, self._closing, every_s)
+        self._read(subscriber, arrive, f"sub-{topic.name}", take if every_s else lambda: [channel.recv()])
 
     def collect(self, topic: Topic, **fields: str | int) -> None:
         subscriber = self._subscriber(topic, fields)
@@ -319,20 +290,18 @@ class ZenohBus:
 
     def _pattern(self, topic: Topic, fields: Mapping[str, str | int]) -> str:
         """The key expression of a subscription or queryable."""
-        return patterned(topic.expression(self._namespace, **fields))
+        return patterned(topic.expression(self.namespace, **fields))
 
     def _subscriber(self, topic: Topic, fields: Mapping[str, str | int]) -> Any:
         expression = self._pattern(topic, fields)
-        subscriber = self._session.declare_subscriber(expression, zenoh.handlers.RingChannel(topic.buffer))
+        subscriber = self.session.declare_subscriber(expression, zenoh.handlers.RingChannel(topic.buffer))
         self._subscribers.setdefault(expression, []).append(subscriber)
         return subscriber
 
-    def serve(self, topic: Topic, post: Post, *, undecoded: bool = False, **fields: str | int) -> None:
+    def serve(self, topic: Topic, post: Post, **fields: str | int) -> None:
         if topic.request is None:
             raise TypeError(f"topic {topic.name} is not a queryable")
         concrete = {name: str(value) for name, value in fields.items()}
-
-        arrivals = zenoh_intake.Arrivals(QUESTION_BYTES, lambda answerer: QUESTION_COST_BYTES + answerer.size)
 
         def enter(query: zenoh.Query) -> None:
             answerer = ZenohAnswerer(self, topic, concrete, query)
@@ -340,41 +309,24 @@ class ZenohBus:
                 answerer.end()
             elif answerer.size > topic.ask_bytes:
                 answerer.decoded()  # which rejects it
-            elif undecoded:
-                asker = asker_in(topic.parse(self._namespace, str(query.key_expr)) or {})
+            else:
+                asker = asker_in(topic.parse(self.namespace, str(query.key_expr)) or {})
                 post(Undecoded(topic, answerer, answerer.decoded, asker))
-            elif not arrivals.put(answerer):
-                answerer.end()
-
-        def arrive(answerer: ZenohAnswerer) -> None:
-            if (asked := answerer.decoded()) is not None:
-                post(asked)
 
         expression = self._pattern(topic, fields)
-        into = zenoh.handlers.Callback(zenoh_intake.guarded(enter), arrivals.end, indirect=False)
-        queryable = self._session.declare_queryable(expression, into)
+        queryable = self.session.declare_queryable(expression, _calling(enter))
         self._queryables.setdefault(expression, []).append(queryable)
-        if undecoded:
-            self._entities.append(queryable)
-        else:
-            self._read(queryable, arrive, f"serve-{topic.name}", arrivals.take)
+        self._entities.append(queryable)
 
     def unserve(self, topic: Topic, **fields: str | int) -> None:
         self._undeclare_all(self._queryables.pop(self._pattern(topic, fields), ()))
 
     def ask(
-        self,
-        topic: Topic,
-        request: Message,
-        post: Post,
-        *,
-        tag: str,
-        timeout_s: float = 2.0,
-        **fields: str | int,
+        self, topic: Topic, request: Message, post: Post, *, tag: str, timeout_s: float = 2.0, **fields: str | int
     ) -> None:
         replies = 0
         failure: str | None = None
-        expression = topic.expression(self._namespace, **fields)
+        expression = topic.expression(self.namespace, **fields)
         asked = meant_for(self.intake.below(expression), encode(request))
         began_s = time.monotonic()
 
@@ -407,9 +359,9 @@ class ZenohBus:
             finish()
             return
         self.intake.sent(asked)
-        self._session.get(
+        self.session.get(
             f"{expression}?{TIMEOUT_PARAMETER}={timeout_s}",
-            zenoh.handlers.Callback(zenoh_intake.guarded(arrive), zenoh_intake.guarded(finish), indirect=False),
+            _calling(arrive, finish),
             target=zenoh.QueryTarget.ALL,
             consolidation=zenoh.ConsolidationMode.NONE,
             timeout=timeout_s,
@@ -421,11 +373,11 @@ class ZenohBus:
     def declare_alive(self, peer: Peer) -> None:
         self._own_peers.append(peer)
         key = ALIVE_KEY.format(role=peer.role, id=peer.id, incarnation=peer.incarnation)
-        self._entities.append(self._session.liveliness().declare_token(f"{self._namespace}/{key}"))
+        self._entities.append(self.session.liveliness().declare_token(f"{self.namespace}/{key}"))
 
     def watch_alive(self, post: Post, role: str = "*") -> None:
         def arrive(sample: zenoh.Sample) -> None:
-            if not str(sample.key_expr).startswith(f"{self._namespace}/"):
+            if not str(sample.key_expr).startswith(f"{self.namespace}/"):
                 return
             try:
                 peer = peer_of(str(sample.key_expr))
@@ -437,19 +389,17 @@ class ZenohBus:
             post(Appeared(peer) if sample.kind == zenoh.SampleKind.PUT else Disappeared(peer))
 
         key = ALIVE_KEY.format(role=role, id="*", incarnation="*")
-        arrivals = zenoh_intake.Arrivals(_TOKEN_BUFFER)
-        subscriber = self._session.liveliness().declare_subscriber(
-            patterned(f"{self._namespace}/{key}"), _into(arrivals), history=True
+        subscriber = self.session.liveliness().declare_subscriber(
+            patterned(f"{self.namespace}/{key}"), _calling(arrive), history=True
         )
-        self._read(subscriber, arrive, "alive", arrivals.take)
+        self._entities.append(subscriber)
 
     def watch_links(self, post: Post) -> None:
         def arrive(event: Any) -> None:
             post(LinkChanged(up=event.kind == zenoh.SampleKind.PUT))
 
-        arrivals = zenoh_intake.Arrivals(_TOKEN_BUFFER)
-        listener = self._session.info.declare_transport_events_listener(_into(arrivals), history=False)
-        self._read(listener, arrive, "links", arrivals.take)
+        listener = self.session.info.declare_transport_events_listener(_calling(arrive), history=False)
+        self._entities.append(listener)
 
     def close(self) -> None:
         """Leaves the network, within `_CLOSE_S` even if the router hangs, for which Zenoh waits ten seconds.
@@ -482,19 +432,18 @@ class ZenohBus:
         for thread in self._threads:
             thread.join(timeout=2.0)
         with contextlib.suppress(zenoh.ZError):  # the router hangs
-            self._session.close()  # type: ignore[no-untyped-call]
+            self.session.close()  # type: ignore[no-untyped-call]
 
     def _read(self, entity: Any, arrive: Callable[[Any], None], name: str, take: Callable[[], Any]) -> None:
         """Makes what `take` returns arrive, one after the other on a thread of its own, until the entity is
-        undeclared: then `take` returns None or raises ZError."""
+        undeclared: then `take` raises ZError."""
         self._entities.append(entity)
 
         def run() -> None:
             try:
-                for item in iter(take, None):
-                    arrive(item)
-                raise BusError(f"{name} receives no more messages")
-            except (BusError, zenoh.ZError):
+                while True:
+                    arrive(take())
+            except zenoh.ZError:
                 if not self.closed and entity in self._entities:
                     raise  # it has ended by itself
 
@@ -503,6 +452,7 @@ class ZenohBus:
         self._threads.append(thread)
 
 
-def _into(arrivals: zenoh_intake.Arrivals) -> Any:
-    """Returns the handler with which an entity is declared, which leaves its items there."""
-    return zenoh.handlers.Callback(arrivals.put, arrivals.end, indirect=False)
+def _calling(arrive: Callable[[Any], None], finish: Callable[[], None] | None = None) -> Any:
+    """Returns the handler of what arrives on Zenoh's own threads. `finish` is called once nothing more arrives."""
+    ends = None if finish is None else zenoh_intake.guarded(finish)
+    return zenoh.handlers.Callback(zenoh_intake.guarded(arrive), ends, indirect=False)

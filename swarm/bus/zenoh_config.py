@@ -226,11 +226,7 @@ def session_config(network: NetworkConfig, mode: str) -> zenoh.Config:
         settings["listen/endpoints"] = []
         settings["connect/endpoints"] = list(network.connect)
         settings["connect/timeout_ms"] = int(network.connect_timeout_s * 1000)
-    settings["connect/retry"] = {
-        "period_init_ms": 100,
-        "period_max_ms": 500,
-        "period_increase_factor": 1.5,
-    }
+    settings["connect/retry"] = {"period_init_ms": 100, "period_max_ms": 500, "period_increase_factor": 1.5}
     if network.tls is not None:
         settings["transport/link/tls"] = tls_settings(network.tls)
     config = zenoh.Config()

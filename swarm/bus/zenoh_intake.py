@@ -10,7 +10,6 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Iterator
-from queue import SimpleQueue
 from typing import Any
 
 import zenoh
@@ -23,75 +22,27 @@ from swarm.wire.access import Act, Authenticator, check_code
 from swarm.wire.messages import Message
 from swarm.wire.topics import Topic, check_size
 
-MOST_TOGETHER = 1024
-"""Most samples in one `HeardMany`, so that a tick does not wait for long."""
 
-
-class Arrivals:
-    """Items received on one entity, in order.
-
-    `recv` of a channel of Zenoh's wakes its thread ten times a second, to look for signals, and asks for the
-    interpreter's lock each time (docs/design/measurement.md). A thread that waits here sleeps until something
-    comes. Zenoh's own thread needs the interpreter's lock to leave an item here, which suits rare items only:
-    frequent samples belong into a channel.
-
-    most    weight of the items that wait; those that come then are dropped
-    weight  of an item
-    """
-
-    def __init__(self, most: int, weight: Callable[[Any], int] = lambda item: 1) -> None:
-        self._received: SimpleQueue[Any] = SimpleQueue()
-        """Received items; None ends the queue."""
-        self._most, self._weight = most, weight
-        self._waiting = 0
-        """Weight of those items."""
-        self._lock = threading.Lock()
-        """Held to change it: several of Zenoh's threads put."""
-
-    def put(self, item: Any) -> bool:
-        """Adds an item; returns False if it is dropped."""
-        weight = self._weight(item)
-        with self._lock:
-            fits = self._waiting + weight <= self._most
-            self._waiting += weight if fits else 0
-        if fits:
-            self._received.put(item)
-        return fits
-
-    def end(self) -> None:
-        """The entity is undeclared."""
-        self._received.put(None)
-
-    def take(self) -> Any:
-        """The next item, once there is one; None after the last."""
-        item = self._received.get()
-        if item is not None:
-            with self._lock:
-                self._waiting -= self._weight(item)
-        return item
-
-
-def waiting_in(channel: Any) -> list[Any]:
-    """All items that wait in a channel; blocks until there is one.
+def taken_from(channel: Any, most: int) -> list[Any]:
+    """Returns the items that wait in a channel, up to a limit; empty if there are none.
 
     `try_recv` keeps the interpreter's lock, `recv` releases it: taking it back for each item costs hundreds of
     times more while another thread is busy.
     """
-    return [channel.recv(), *taken_from(channel, MOST_TOGETHER - 1)]
-
-
-def taken_from(channel: Any, most: int) -> list[Any]:
-    """Returns the items that wait in a channel, up to a limit; empty if there are none."""
     items: list[Any] = []
     while len(items) < most and (item := channel.try_recv()) is not None:
         items.append(item)
     return items
 
 
+_MOST_AT_ONCE = 1024
+"""Most samples that a slow reader takes at once."""
+
+
 def taken_after(channel: Any, closing: threading.Event, wait_s: float) -> list[Any]:
     """The items in a channel, `wait_s` after the first that came; none once it is closing."""
     first = channel.recv()
-    return [] if closing.wait(wait_s) else [first, *taken_from(channel, MOST_TOGETHER)]
+    return [] if closing.wait(wait_s) else [first, *taken_from(channel, _MOST_AT_ONCE)]
 
 
 _own = threading.local()

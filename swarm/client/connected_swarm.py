@@ -389,14 +389,10 @@ def connect(
         raise
     thread = SwarmThread(session, inbox.take)
 
-    def stop() -> None:
-        thread.end()
-        inbox.close()
-
     def open_trusted() -> Bus:
         return open_bus(network, authenticator=authenticator_of(network, session.run.run_id))
 
-    swarm = Swarm(session, stop, open_trusted)
+    swarm = Swarm(session, thread.end, open_trusted)
     atexit.register(swarm.close)  # a program that ends takes its vehicles away
     return swarm
 

@@ -204,16 +204,9 @@ class Session:
             except (ValueError, IndexError) as error:
                 found.set_exception(BusError(f"the planner of {target!r} answers nonsense: {error}"))
 
-        self.ask_planner(request, timeout_s, target, vehicle).add_done_callback(finish)
+        topic, asker = (NAMELESS_ROUTE, {}) if vehicle is None else (ROUTE, {"asker": asker_of("rover", vehicle)})
+        self.ask(topic, request, timeout_s, target=target, **asker).add_done_callback(finish)
         return found
-
-    def ask_planner(
-        self, request: RouteRequest, timeout_s: float, target: str, vehicle: str | None
-    ) -> Future[list[Any]]:
-        """All answers of a planner, asked under the name of a vehicle."""
-        if vehicle is None:
-            return self.ask(NAMELESS_ROUTE, request, timeout_s, target=target)
-        return self.ask(ROUTE, request, timeout_s, target=target, asker=asker_of("rover", vehicle))
 
     def answers(self, waiting: Future[Any], timeout_s: float) -> Any:
         """Waits for the replies to a query. Raises BusError; ConfigError if called on the thread that delivers
@@ -262,13 +255,11 @@ class Session:
                         self.call(lambda: waiting.set_exception(BusError(f"no answer: {failure}")))
                     else:
                         self.call(lambda: waiting.set_exception(NoAnswerError("no process answers")))
-                case LinkChanged(up=up):
-                    self.connected = up
-                    if up:
-                        self._compare_run()
-                    for part in self._parts:
-                        part.on_event(event, now_ns)
                 case _:
+                    if isinstance(event, LinkChanged):
+                        self.connected = event.up
+                        if event.up:
+                            self._compare_run()
                     for part in self._parts:
                         part.on_event(event, now_ns)
         self._call_later()

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 import reprlib
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from functools import cached_property
 from textwrap import shorten
 from typing import Any
@@ -70,11 +70,11 @@ class Frame:
 
     def written(self, cell: int) -> str:
         """A cell for people, in each form that `cell_named` reads. Raises as `centre_m` and `to_wgs84`."""
-        return written(self, checked_cells(self, (cell,))[0])
+        return written(self, checked_cell(self, cell))
 
     def centre_m(self, cell: int) -> Point:
         """(x_m, y_m) of the middle of a cell. Raises ConfigError on one outside the terrain."""
-        return self.grid.centre_m(checked_cells(self, (cell,))[0])
+        return self.grid.centre_m(checked_cell(self, cell))
 
     def cells_within(self, x_m: float, y_m: float, radius_m: float) -> list[int]:
         """Returns the cells whose middle is within `radius_m` of a place inside the terrain, and its own cell."""
@@ -128,19 +128,15 @@ def _degrees_of(system: Any) -> str:
     return f"+proj=longlat +a={ellipsoid.semi_major_metre!r} +b={ellipsoid.semi_minor_metre!r} +no_defs"
 
 
-def checked_cells(frame: Frame, cells: Iterable[int]) -> list[int]:
-    """Cells of the terrain, each once. Raises ConfigError on a cell outside the terrain, and on a value that is not
-    a cell."""
-    once: dict[int, None] = {}
-    for each in cells:
-        try:
-            cell = whole(each)
-        except TypeError:
-            raise ConfigError(f"cell {reprlib.repr(each)} is no whole number") from None
-        if not 0 <= cell < frame.grid.cells:
-            raise ConfigError(f"cell {cell} is outside the terrain of {frame.grid.rows} x {frame.grid.cols} cells")
-        once[cell] = None
-    return list(once)
+def checked_cell(frame: Frame, given: int) -> int:
+    """A cell of the terrain. Raises ConfigError on one outside the terrain, and on a value that is not a cell."""
+    try:
+        cell = whole(given)
+    except TypeError:
+        raise ConfigError(f"cell {reprlib.repr(given)} is no whole number") from None
+    if not 0 <= cell < frame.grid.cells:
+        raise ConfigError(f"cell {cell} is outside the terrain of {frame.grid.rows} x {frame.grid.cols} cells")
+    return cell
 
 
 def number(name: str, value: Any) -> float:

@@ -11,7 +11,7 @@ from swarm.bus.bus import Asked, Event, Heard, LinkChanged
 from swarm.client.own_reports import Reported
 from swarm.client.route import Route
 from swarm.client.session import Session, Stream
-from swarm.client.terrain_frame import checked_cells
+from swarm.client.terrain_frame import checked_cell
 from swarm.clock import NS_PER_S
 from swarm.config.scenario import agent_of
 from swarm.errors import ConfigError
@@ -19,7 +19,7 @@ from swarm.grid import TILE_CELLS, GridSpec
 from swarm.wire.messages import map_data, planning
 from swarm.wire.messages.vehicles import LONGEST_OBSTACLE_LEASE_S, MOST_M_PER_S, MOST_RADIUS_M, Obstacle
 from swarm.wire.route_columns import RouteStatus
-from swarm.wire.topics import DIGEST, MARKS, OBSTACLE, PLACE_ROUTE, PUSHED_ROUTE, asker_of
+from swarm.wire.topics import DIGEST, MARKS, OBSTACLE, PLACE_ROUTE, PUSHED_ROUTE, ROUTE, asker_of
 
 if TYPE_CHECKING:
     from swarm.right_of_way.external_session import ExternalSession
@@ -235,7 +235,7 @@ class Vehicle(Reported):
         `right_of_way`.
         """
         way, here = self._has_way(), self.cell
-        wanted = [checked_cells(self._session.frame, (cell,))[0] for cell in cells]
+        wanted = [checked_cell(self._session.frame, cell) for cell in cells]
         path = [here, *(wanted[1:] if wanted[:1] == [here] else wanted)]
         try:
             way.want(path)
@@ -249,7 +249,7 @@ class Vehicle(Reported):
         """Returns True if the vehicle may drive into a cell now, after waiting up to a timeout. Raises ConfigError
         unless it was made with `right_of_way`."""
         wait_s = self._session.number("timeout_s", timeout_s, 0, 1e9)
-        return self._has_way().may_enter(checked_cells(self._session.frame, (cell,))[0], wait_s)
+        return self._has_way().may_enter(checked_cell(self._session.frame, cell), wait_s)
 
     def _has_way(self) -> ExternalSession:
         if self._way is None:
@@ -319,12 +319,13 @@ class Vehicle(Reported):
             "vehicles": [self.id],
             "vehicle_class": self.vehicle_class,
         }
+        asker = asker_of("rover", self.id)
         if self._goal is None:
             request = planning.RouteRequest(force=ran_out, **from_here)
-            asked = self._session.ask_planner(request, _TIMEOUT_S, target, self.id)
+            asked = self._session.ask(ROUTE, request, _TIMEOUT_S, target=target, asker=asker)
         else:
             place = planning.PlaceRouteRequest(to=self._goal, **from_here)
-            asked = self._session.ask(PLACE_ROUTE, place, _TIMEOUT_S, asker=asker_of("rover", self.id))
+            asked = self._session.ask(PLACE_ROUTE, place, _TIMEOUT_S, asker=asker)
         self._asking = target
 
         def finish(done: Future[list[Any]]) -> None:
@@ -400,7 +401,7 @@ class Vehicle(Reported):
         with session.lock:
             session.check_open()
             try:
-                once = checked_cells(session.frame, cells)
+                once = dict.fromkeys(checked_cell(session.frame, cell) for cell in cells)
             except ConfigError as error:
                 raise session.refused(str(error)) from None
             if not once:

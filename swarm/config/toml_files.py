@@ -88,10 +88,7 @@ def _is_of(own: str, other: str) -> bool:
 
 
 def parse_scenario(
-    text: str,
-    source: str = "scenario",
-    base: Path | None = None,
-    settings: Mapping[str, Any] | None = None,
+    text: str, source: str = "scenario", base: Path | None = None, settings: Mapping[str, Any] | None = None
 ) -> Scenario:
     """Like `load_scenario`, but from a string. Relative paths in it are resolved against `base`, if given. `source`
     names the text in errors.

@@ -55,11 +55,6 @@ def versions() -> dict[str, str]:
     return found
 
 
-def path_of(folder: Path, role: str, id: str, incarnation: int) -> Path:
-    """Returns the file of the recording of one process, below a run's folder."""
-    return folder / recording_file.FOLDER / f"{role}-{id}.{incarnation}{recording_file.SUFFIX}"
-
-
 class Recording(Crossing):
     """Writes down what enters and leaves one service.
 
@@ -69,7 +64,8 @@ class Recording(Crossing):
 
     def __init__(self, setup: RoleSetup, terrain: str, folder: Path) -> None:
         super().__init__()
-        self._writer = recording_file.RecordWriter(path_of(folder, setup.role, setup.id, setup.incarnation))
+        name = f"{setup.role}-{setup.id}.{setup.incarnation}{recording_file.SUFFIX}"
+        self._writer = recording_file.RecordWriter(folder / recording_file.FOLDER / name)
         self._outputs: list[recording_file.Output] = []
         self._jobs = 0
         self._job = threading.local()

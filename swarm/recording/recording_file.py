@@ -30,7 +30,7 @@ from swarm.errors import ProtocolError, StoreError
 from swarm.peers import Peer
 from swarm.recording.service_boundary import content_of
 from swarm.runtime.stats import Counters, Histogram
-from swarm.wire.codec import decode, decode_either, decode_many
+from swarm.wire.codec import decode, decode_either
 from swarm.wire.topics import TOPICS
 
 log = logging.getLogger(__name__)
@@ -105,7 +105,7 @@ class Handled(Record, frozen=True, tag=2):
     kind     the name of its class in `swarm.bus.bus`
     topic    its name; empty of an event that has none
     chunks   of the key, in the order of the topic's fields
-    samples  (key below the namespace, payload) of each message; the key of a single one is empty
+    samples  ("", payload) of its message, if it has one
     rest     the other fields of the event
     """
 
@@ -314,7 +314,6 @@ class RecordReader:
 _TOPICS = {topic.name: topic for topic in TOPICS}
 _REST: dict[str, Any] = {
     "Heard": tuple[()],
-    "HeardMany": tuple[()],
     "Asked": tuple[float],
     "Replied": tuple[str, float],
     "AskEnded": tuple[str, int, str | None],
@@ -341,8 +340,6 @@ def record_of(event: bus.Event, now_ns: int) -> Handled:
     match event:
         case bus.Heard(message=message):
             samples = [("", content_of(message))]
-        case bus.HeardMany(samples=many):
-            samples = [(key, content_of(message)) for key, message in many]
         case bus.Asked(request=message):
             samples, rest = [("", content_of(message))], (event.timeout_s,)
         case bus.Replied(message=message):
@@ -403,13 +400,6 @@ def event_of(record: Handled, answerer: bus.Answerer) -> bus.Event:
             case "AskEnded", _:
                 tag, replies, failure = rest
                 return bus.AskEnded(tag, topic, replies, failure)
-            case "HeardMany", _:
-                samples = []
-                for (key, _), message in zip(record.samples, decode_many(payloads, topic.message), strict=True):
-                    if isinstance(message, ProtocolError):
-                        raise message
-                    samples.append((key, message))
-                return bus.HeardMany(topic, samples)
     except ProtocolError as error:
         raise StoreError(f"a recorded message is none to this build: {error}") from error
     raise StoreError(f"a record of {record.kind} on topic {topic.name} that is no event")

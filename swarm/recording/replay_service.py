@@ -38,9 +38,9 @@ class Difference:
     replayed: str | None
 
 
-@dataclass(frozen=True, kw_only=True)
+@dataclass
 class Outcome:
-    """Result of a replay.
+    """Result of a replay, as far as it has come.
 
     events      how many were fed whose outputs are the same
     outputs     how many were compared
@@ -50,11 +50,11 @@ class Outcome:
     damaged     why it could not be read to its end, in a sentence
     """
 
-    events: int
-    outputs: int
-    seconds: float
-    difference: Difference | None
-    ended: str
+    events: int = 0
+    outputs: int = 0
+    seconds: float = 0.0
+    difference: Difference | None = None
+    ended: str = "was killed"
     damaged: str | None = None
 
 
@@ -167,27 +167,19 @@ class _Replay:
     boundary: Replaying
     until_s: float | None
     service: Service | None = None
-    events: int = 0
-    outputs: int = 0
-    seconds: float = 0.0
-    ended: str = "was killed"
+    outcome: Outcome = field(default_factory=Outcome)
 
     def run(self) -> Outcome:
-        difference: Difference | None = None
+        outcome = self.outcome
         for step in self._steps():
-            difference = self._feed(step)
-            if difference is not None:
+            outcome.difference = self._feed(step)
+            if outcome.difference is not None:
+                outcome.ended = ""
                 break
-            self.events += step.call is not None
-            self.outputs += len(step.outputs)
-        return Outcome(
-            events=self.events,
-            outputs=self.outputs,
-            seconds=self.seconds,
-            difference=difference,
-            ended="" if difference is not None else self.ended,
-            damaged=self.reader.damaged,
-        )
+            outcome.events += step.call is not None
+            outcome.outputs += len(step.outputs)
+        outcome.damaged = self.reader.damaged
+        return outcome
 
     def _steps(self) -> Iterator[_Step]:
         """The calls in the recording that are whole: the last one of a process that was killed may not be."""
@@ -201,35 +193,35 @@ class _Replay:
             elif isinstance(record, recording_file.Called | recording_file.Handled):
                 yield step
                 if until_ns is not None and record.now_ns > until_ns:
-                    self.ended = f"replayed until {self.until_s:g} s"
+                    self.outcome.ended = f"replayed until {self.until_s:g} s"
                     return
                 step = _Step(record)
             elif isinstance(record, recording_file.Ended):
                 yield step
-                self.ended = "ended as asked"
+                self.outcome.ended = "ended as asked"
                 return
             elif isinstance(record, recording_file.Cut):
-                self.ended = record.why
+                self.outcome.ended = record.why
                 return
             else:
                 raise StoreError(f"{self.reader.path} is damaged: a second head")
         if _was_raised(step):
             yield step
-            self.ended = "ended by an error"
+            self.outcome.ended = "ended by an error"
 
     def _feed(self, step: _Step) -> Difference | None:
         boundary, call = self.boundary, step.call
         boundary.reads, boundary.outputs = step.reads, []
         stray: str | None = None
         if call is not None:
-            self.seconds = (call.now_ns - self.reader.head.started_ns) / NS_PER_S
+            self.outcome.seconds = (call.now_ns - self.reader.head.started_ns) / NS_PER_S
         try:
             self._call(call)
         except _NotRecorded as missing:
             stray = f"reads {missing}, which is not in the recording there"
         except StoreError as error:
             if not _was_raised(step):
-                raise StoreError(f"event {self.events + 1} of {self.reader.path}: {error}") from error
+                raise StoreError(f"event {self.outcome.events + 1} of {self.reader.path}: {error}") from error
             boundary.raised(error)
         except Exception as error:
             boundary.raised(error)
@@ -252,9 +244,9 @@ class _Replay:
 
     def _difference(self, step: _Step, recorded: recording_file.Output | None, replayed: str | None) -> Difference:
         return Difference(
-            event=self.events + (step.call is not None),
+            event=self.outcome.events + (step.call is not None),
             what=MAKING if step.call is None else described(step.call),
-            seconds=self.seconds,
+            seconds=self.outcome.seconds,
             recorded=None if recorded is None else _named(recorded),
             replayed=replayed,
         )

@@ -160,26 +160,20 @@ class BoundaryBus:
 
     def __init__(self, bus: Bus, crossing: Crossing) -> None:
         self._bus = bus
-        self.proves_names = bus.proves_names
+        self.namespace, self.proves_names = bus.namespace, bus.proves_names
         self._crossing = crossing
-
-    @property
-    def namespace(self) -> str:
-        return self._bus.namespace
 
     @property
     def counts(self) -> Mapping[str, int]:
         return self._crossing.read_as("counts of the bus", lambda: dict(self._bus.counts), dict[str, int])
 
     def publish(self, topic: Topic, message: Message, **fields: str | int) -> None:
-        self._crossing.let_out(f"put {topic.below(topic.one(fields))}", content_of(message), message)
+        self._crossing.let_out(f"put {topic.value(fields)[1]}", content_of(message), message)
         self._bus.publish(topic, message, **fields)
 
-    def subscribe(
-        self, topic: Topic, post: Post, *, together: bool = False, every_s: float = 0.0, **fields: str | int
-    ) -> None:
-        self._says("subscribe", topic, fields, f" together={together} every_s={every_s:g}")
-        self._bus.subscribe(topic, post, together=together, every_s=every_s, **fields)
+    def subscribe(self, topic: Topic, post: Post, *, every_s: float = 0.0, **fields: str | int) -> None:
+        self._says("subscribe", topic, fields, f" every_s={every_s:g}")
+        self._bus.subscribe(topic, post, every_s=every_s, **fields)
 
     def collect(self, topic: Topic, **fields: str | int) -> None:
         self._says("collect", topic, fields)
@@ -219,23 +213,16 @@ class BoundaryBus:
         self._says("unsubscribe", topic, fields)
         self._bus.unsubscribe(topic, **fields)
 
-    def serve(self, topic: Topic, post: Post, *, undecoded: bool = False, **fields: str | int) -> None:
+    def serve(self, topic: Topic, post: Post, **fields: str | int) -> None:
         self._says("serve", topic, fields)
-        self._bus.serve(topic, post, undecoded=undecoded, **fields)
+        self._bus.serve(topic, post, **fields)
 
     def unserve(self, topic: Topic, **fields: str | int) -> None:
         self._says("unserve", topic, fields)
         self._bus.unserve(topic, **fields)
 
     def ask(
-        self,
-        topic: Topic,
-        request: Message,
-        post: Post,
-        *,
-        tag: str,
-        timeout_s: float = 2.0,
-        **fields: str | int,
+        self, topic: Topic, request: Message, post: Post, *, tag: str, timeout_s: float = 2.0, **fields: str | int
     ) -> None:
         to = f"ask {topic.below(topic.every(fields))} {tag} timeout_s={timeout_s:g}"
         self._crossing.let_out(to, content_of(request), request)

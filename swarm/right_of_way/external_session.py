@@ -20,7 +20,7 @@ from swarm.clock import NS_PER_S, MonotonicClock
 from swarm.errors import BusError, ConfigError, SwarmError
 from swarm.grid import GridSpec
 from swarm.peers import Peer
-from swarm.right_of_way.external_vehicle import Answers, ExternalVehicle, Removal, SaveGenerations
+from swarm.right_of_way.external_vehicle import Answers, ExternalVehicle, Removal
 from swarm.right_of_way.generations import MemoryGenerations
 from swarm.right_of_way.holdings import Tell
 from swarm.right_of_way.host import AskKnown
@@ -123,7 +123,8 @@ class ExternalService:
                 self._asking = False
                 self._ask_due_ns = now_ns + _ASK_AGAIN_NS
                 if self.external is not None:
-                    self._perform(self.external.begin(self._chance(now_ns)), now_ns)
+                    if generations := self.external.begin(self._chance(now_ns)):
+                        self.generations.save(generations)
                     self.tell(now_ns)
             case Appeared(peer=peer) | Disappeared(peer=peer) if (peer.role, peer.id) == (_ROLE, self.name):
                 up = isinstance(event, Appeared)
@@ -184,8 +185,6 @@ class ExternalService:
             match action:
                 case AskKnown():
                     self._ask(now_ns)
-                case SaveGenerations(generations):
-                    self.generations.save(generations)
                 case Left() as left:
                     self.bus.publish(LEFT, left, host=left.host, agent=self.name)
                 case Tell(members, standing):
@@ -341,7 +340,6 @@ class ExternalSession:
             with self._changed:
                 self._closed.set()
                 self._service.stop()
-            self._inbox.close()
             self._thread.join(2 * _TICK_S + 1.0)
             self._bus.close()
             self._generations.close()

@@ -5,7 +5,6 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Sequence
-from dataclasses import dataclass
 from itertools import pairwise
 
 from swarm.clock import NS_PER_S
@@ -21,13 +20,6 @@ _PATIENCE_NS = 3 * NS_PER_S
 """For this time it waits behind others that do not go on; then it gives its place behind them back."""
 _OLDEST_MS = 1 << 31
 """Greatest age that is sent: half of the message's range, so that a push may still add to it."""
-
-
-@dataclass(frozen=True, slots=True)
-class SaveGenerations:
-    """Put these on file before what follows is said."""
-
-    generations: list[int]
 
 
 class Answers:
@@ -67,7 +59,7 @@ class Answers:
         )
 
 
-ExternalAction = AskKnown | SaveGenerations | Tell | Left
+ExternalAction = AskKnown | Tell | Left
 
 
 class ExternalVehicle:
@@ -169,8 +161,9 @@ class ExternalVehicle:
         """True if no recovery query is pending."""
         return not self.needs_generation and self.host.informed
 
-    def begin(self, chance: int) -> list[ExternalAction]:
-        """Begins a generation, once all agents that could be asked have answered.
+    def begin(self, chance: int) -> list[int]:
+        """Begins a generation if one is needed, once all agents that could be asked have answered. Returns the
+        generations to put on file before anything is said; empty if none has begun.
 
         chance  a random number
         """
@@ -179,7 +172,7 @@ class ExternalVehicle:
         assert self._cell is not None
         self._generations = self.host.begin(self._generations, chance)
         self.host.enter(self.vehicle, self._cell)
-        return [SaveGenerations(self._generations)]
+        return self._generations
 
     def tick(self, now_ns: int) -> list[ExternalAction]:
         """Returns the messages to send in this tick."""

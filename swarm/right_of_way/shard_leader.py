@@ -189,14 +189,7 @@ class Leader:
         bodies = {id: stand.cell for id, stand in stands.items() if is_entering(stand)}
         before = self._orders.by_host_count(host)
         self._granted |= self._orders.take_host_state(
-            host,
-            standing.generation,
-            standing.seq,
-            holds,
-            standing.knows,
-            standing.dead,
-            bodies,
-            self._next_stamp,
+            host, standing.generation, standing.seq, holds, standing.knows, standing.dead, bodies, self._next_stamp
         )
         self._changed |= self._orders.by_host_count(host) != before
         self.seq = max(self.seq, self._orders.newest - 1)  # the next table is not older than its entries

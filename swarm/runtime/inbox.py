@@ -157,8 +157,6 @@ LATE_S = 0.5
 """Once the oldest question of an asker has waited this long, or half of its asker's timeout, the newest is taken
 first: an answer to it still finds its asker."""
 
-_UNREAD_BATCHES = 2
-"""Unread batches beyond which `post` blocks: one to be read while the next is decoded."""
 _KEPT = ""
 """Name of the queue of items that are never dropped."""
 _ASKED = "?"
@@ -180,7 +178,6 @@ class Inbox:
                asker: then its oldest is. One whose asker has left is refused, too. One that is `Undecoded` is
                decoded in its turn. Askers take turns and pay by bytes; on a costly topic agents come before
                others, and askers without a name share one turn.
-    Batches    (`HeardMany`) are bounded by blocking their poster.
     The rest   is never dropped: replies, ends of our own questions, tokens, links, results of workers, errors.
 
     Events are taken in the order of their arrival, if only one asker asks. While a question comes late (`LATE_S`),
@@ -197,12 +194,6 @@ class Inbox:
         self._bell.acquire()
         self._asleep = False
         """True if `take` waits for the bell; the thread that sets it to false releases the bell."""
-        self._batch_taken = threading.Event()
-        """Set when a batch is taken, and when the inbox closes."""
-        self._unread_batches = 0
-        """`HeardMany` events posted and not yet taken."""
-        self._closed = False
-        """Set by `close`, for good."""
         self._queues: OrderedDict[str, _Queue] = OrderedDict()
         """Unread events by kind and topic. The queue whose turn was longest ago comes first."""
         self._asked: FairQueue[tuple[int, bus.Question]] = FairQueue(bus.QUESTION_BYTES, PER_ASKER_BYTES)
@@ -218,26 +209,13 @@ class Inbox:
         before their turn came."""
 
     def post(self, event: bus.Event) -> None:
-        """Adds an event, from any thread.
-
-        With a `HeardMany` it blocks the caller while more than two batches are unread. The bus then drops its
-        oldest samples instead of this inbox growing.
-        """
+        """Adds an event, from any thread."""
         if isinstance(event, bus.Heard):
             newest = tuple(event.fields.values()) if event.topic.newest else None
             self._put(event, event.topic.name, newest)
         elif isinstance(event, bus.Question):
             for dropped in self._put_question(event):
                 _refuse(dropped, f"too many questions wait{f' of {dropped.asker}' if dropped.asker else ''}")
-        elif isinstance(event, bus.HeardMany):
-            with self._lock:
-                self._unread_batches += 1
-                self._put(event, _KEPT)
-            while True:
-                self._batch_taken.clear()
-                if self._unread_batches <= _UNREAD_BATCHES or self._closed:
-                    break
-                self._batch_taken.wait()
         else:
             self._put(event, _KEPT)
 
@@ -276,7 +254,7 @@ class Inbox:
         with self._lock:
             self._next += 1
             self._queues.setdefault(_ASKED, OrderedDict())
-            price = bus.QUESTION_COST_BYTES + question.size
+            price = bus.QUESTION_COST_BYTES + question.answerer.size
             dropped = self._asked.put(asker, (self._next, question), price=price, rank=rank)
             self._unread += 1 - len(dropped)
             self.counts["events_dropped"] += len(dropped)
@@ -299,10 +277,6 @@ class Inbox:
             event = self._pop(expired)
         for asked in expired:
             _refuse(asked, f"no answer within the {asked.timeout_s:g} s of its asker: too many questions")
-        if isinstance(event, bus.HeardMany):
-            with self._lock:
-                self._unread_batches -= 1
-            self._batch_taken.set()
         if isinstance(event, BaseException):
             raise event
         return event.decoded() if isinstance(event, bus.Undecoded) else event
@@ -347,11 +321,6 @@ class Inbox:
         """Ends a `take` that waits, from any thread and from a signal handler."""
         with self._lock:
             self._ring()
-
-    def close(self) -> None:
-        """There are no more takes: `post` does not block from now on."""
-        self._closed = True
-        self._batch_taken.set()
 
     def _ring(self) -> None:
         if self._asleep:

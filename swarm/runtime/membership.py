@@ -35,16 +35,12 @@ class Alarms:
         again."""
         self._over: deque[Alarm] = deque((each for each in before if each.over_ns is not None), maxlen=_MOST_OVER)
 
-    def happened(
-        self, kind: str, about: str, text: str, now_ns: int, cell: int | None = None, target: str | None = None
-    ) -> None:
+    def happened(self, kind: str, about: str, text: str, now_ns: int, cell: int | None = None) -> None:
         """Reports an event that is over at once, such as a collision."""
+        text = text[:MOST_TEXT]
         self._over.append(
-            Alarm(
-                kind=kind, about=about[:100], text=text[:MOST_TEXT], since_ns=now_ns, over_ns=now_ns,
-                cell=cell, target=target,
-            )
-        )  # fmt: skip
+            Alarm(kind=kind, about=about[:100], text=text, since_ns=now_ns, over_ns=now_ns, cell=cell)
+        )
 
     def begin(
         self, kind: str, about: str, text: str, now_ns: int, cell: int | None = None, target: str | None = None

@@ -289,7 +289,6 @@ class Process:
                 signal.signal(number, signal.SIG_IGN)
             if self._health is not None:
                 self._health.ends()
-            self._inbox.close()
             counters.set_counts(self._inbox.counts)
             self._service.stop(self._after_inbox_ns())
 

@@ -268,10 +268,11 @@ def _rules_of(struct: type[Bounded]) -> tuple[Rule, ...]:
     for name, hint in typing.get_type_hints(struct, include_extras=True).items():
         bare, notes = taken_apart(hint)
         parts = [note for part in typing.get_args(bare) for note in taken_apart(part)[1]]
-        if any(isinstance(note, Characters) for note in notes):
+        listed = any(isinstance(note, Characters) for note in parts)
+        if any(isinstance(note, Characters) for note in notes) or (listed and NoneType in typing.get_args(bare)):
             ids.append(name)
-        if any(isinstance(note, Characters) for note in parts):
-            rules.append(_id_or_none(name) if NoneType in typing.get_args(bare) else _all_ids(name))
+        elif listed:
+            rules.append(_all_ids(name))
         for part in typing.get_args(bare):
             if isinstance(part, type) and issubclass(part, Part):
                 rules.extend(_ids_of_parts(name, id) for id in _ids_in(part))
@@ -312,7 +313,8 @@ def _ids_rule(get: Callable[[Any], Iterable[Any]], named: Callable[[Any], Iterab
     def rule(struct: Any) -> None:
         if not _KNOWN_IDS.issuperset(get(struct)):
             for name, value in named(struct):
-                check_id(name, value)
+                if value is not None:  # msgspec lets None pass only where there may be none
+                    check_id(name, value)
 
     return rule
 
@@ -321,17 +323,6 @@ def _each_id(names: list[str]) -> Rule:
     """Ids that are fields."""
     get = attrgetter(*names, names[0])  # a tuple even of one
     return _ids_rule(get, lambda struct: ((name, getattr(struct, name)) for name in names))
-
-
-def _id_or_none(name: str) -> Rule:
-    get = attrgetter(name)
-
-    def rule(struct: Any) -> None:
-        value = get(struct)
-        if value is not None and value not in _KNOWN_IDS:
-            check_id(name, value)
-
-    return rule
 
 
 def _all_ids(name: str) -> Rule:

@@ -100,34 +100,30 @@ class Topic:
             raise TypeError(f"topic {self.name} has no field {unknown}; it has {', '.join(named)}")
         return named
 
-    def one(self, fields: Mapping[str, str | int]) -> dict[str, str]:
-        """All fields of one value, without wildcards. Raises TypeError on a missing one, and as `every`."""
-        named = self.every(fields)
-        for name, chunk in named.items():
-            if chunk == "*":
-                raise TypeError(f"topic {self.name} needs the field {name}")
-        return named
-
     def expression(self, namespace: str, **fields: str | int) -> str:
         """The key expression for these fields; those not given become `*`. Raises as `every`."""
         return f"{namespace}/{self.key.format(**self.every(fields))}"
 
     def value(self, fields: Mapping[str, str | int]) -> tuple[Mapping[str, str], str]:
-        """The fields of one value as `one` has them, and its key below the namespace. Raises as `one`.
+        """The fields of one value, without wildcards, and its key below the namespace. Raises TypeError on a
+        missing field, and as `every`.
 
         A process puts under the same few keys again and again, so both are remembered.
         """
         given = tuple(fields.items())
         value = self._values.get(given)
         if value is None:
-            named = self.one(fields)
+            named = self.every(fields)
+            for name, chunk in named.items():
+                if chunk == "*":
+                    raise TypeError(f"topic {self.name} needs the field {name}")
             if len(self._values) >= _MOST_VALUES:
                 self._values.clear()
             value = self._values[given] = named, self.below(named)
         return value
 
     def keyed(self, namespace: str, **fields: str | int) -> str:
-        """The key of one value. Raises as `one`."""
+        """The key of one value. Raises as `value`."""
         return f"{namespace}/{self.value(fields)[1]}"
 
     def below(self, fields: Mapping[str, str]) -> str:

@@ -87,10 +87,7 @@ def load(names: Iterable[str] = BENCHMARKS) -> typer.Typer:
 
 
 def benchmark(
-    name: str | None = None,
-    *,
-    columns: Sequence[str] = (),
-    fails: Sequence[str] = (),
+    name: str | None = None, *, columns: Sequence[str] = (), fails: Sequence[str] = ()
 ) -> Callable[[Callable[..., dict[str, Any]]], Callable[..., dict[str, Any]]]:
     """Makes a command of a function which returns a report.
 

@@ -37,7 +37,7 @@ class Slow(Idle):
         self._bus, self._inbox = bus, inbox
 
     def start(self, now_ns: int) -> None:
-        self._bus.serve(COST, self._wait, undecoded=True, target="t0")
+        self._bus.serve(COST, self._wait, target="t0")
 
     def _wait(self, question: Event) -> None:
         assert isinstance(question, Undecoded)

@@ -10,6 +10,7 @@ from pathlib import Path
 
 import msgspec
 import pytest
+from support.bus_world import decoded
 from support.client_rig import keeper_info
 from support.live_swarm import Hands, swarm
 from support.makers import route_reply
@@ -164,9 +165,9 @@ def test_a_rover_with_a_certificate_reports_marks_and_asks_under_its_own_name_on
         opened(hands, "planner", "t0", certs, endpoint) as planner,
         opened(hands, "agent", "a0", certs, endpoint) as agent,
     ):
-        keeper.serve(RUN, answer, role="keeper", id="0")
+        keeper.serve(RUN, decoded(answer), role="keeper", id="0")
         keeper.subscribe(MARKS, tell)
-        planner.serve(ROUTE, answer, target="t0")
+        planner.serve(ROUTE, decoded(answer), target="t0")
         agent.subscribe(OBSTACLE, tell)
         files = [str(certs / name) for name in ("ca.pem", "rover.all.r1.pem", "rover.all.r1.key")]
         with connect(endpoint, ca=files[0], certificate=files[1], key=files[2]) as program:

@@ -12,6 +12,7 @@ from typing import Any
 
 import msgpack
 import pytest
+from support.bus_world import decoded
 from support.effort import few
 from support.wire_strategies import BY_TYPE
 from support.zenoh_router import Router
@@ -59,7 +60,7 @@ class Listener:
                 if topic.published:
                     bus.subscribe(topic, self.taken.append)
                 if topic.request is not None:
-                    bus.serve(topic, self._asked, **fields_of(topic))
+                    bus.serve(topic, decoded(self._asked), **fields_of(topic))
         own, concerns = bus.intake._own, bus.intake.concerns
 
         def own_samples(samples: list[Any]) -> list[Any]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import os
-import re
 import signal
 import socket
 import subprocess
@@ -12,14 +11,13 @@ import sys
 import threading
 import time
 from collections.abc import Callable, Iterator
-from pathlib import Path
 
 import msgspec
 import pytest
 import zenoh
 from support.bus_behaviour import *  # noqa: F403
 from support.bus_behaviour import MARKS, TRUE_POSE
-from support.bus_world import Box, answering, asked, heard_by, marks, pose
+from support.bus_world import Box, answering, asked, decoded, heard_by, marks, pose
 from support.dummy_roles import Idle
 from support.makers import cost_reply, run_info
 from support.processes import eventually
@@ -31,7 +29,7 @@ from support.zenoh_router import Router
 from docs.generate.wire_page import JSON_PATH as WIRE_PAGE
 from docs.generate.wire_page import example, key_fields, put_from_outside
 from launch_scripts.ports import free_ports
-from swarm.bus.bus import Appeared, Asked, AskEnded, Disappeared, Heard, HeardMany, LinkChanged, Replied, meant_for
+from swarm.bus.bus import Appeared, Asked, AskEnded, Disappeared, Heard, LinkChanged, Replied, meant_for
 from swarm.bus.zenoh_bus import ZenohBus, open_bus
 from swarm.clock import MonotonicClock
 from swarm.config.scenario import NetworkConfig
@@ -113,10 +111,10 @@ def world(router: Router) -> Iterator[ZenohWorld]:
 
 def test_a_person_may_put_json_by_its_encoding_and_leave_out_what_the_key_says(world: ZenohWorld):
     a, b = world.bus("a"), world.bus("b")
-    alone, together = Box(), Box()
+    alone = Box()
     b.subscribe(TRUE_POSE, alone)
     b.collect(TRUE_POSE)
-    b.subscribe(MARKS, together, together=True)
+    b.collect(MARKS)
     world.settle()
     unnamed = b' {"incarnation": 1, "seq": 1, "stamp_ns": 5, "cell": 3, "x_m": 1, "y_m": 2.0}'
     short = unnamed[:-1] + b', "key": "world/target/t0/pose"}'
@@ -130,11 +128,17 @@ def test_a_person_may_put_json_by_its_encoding_and_leave_out_what_the_key_says(w
     world.put_bytes(a, TRUE_POSE, b'{"target": "t9", ' + short[2:].replace(b"t0", b"t3"), in_json=True, target="t3")
     world.put_bytes(a, MARKS, encode_json(marks("a0.1", 7)), in_json=True, region="0", tile="7", author="a0.1")
     world.put_bytes(a, MARKS, b'{"epoch": "x"', in_json=True, region="0", tile="8", author="a0.1")
-    world.until(lambda: len(alone) == 2 and together)
+    world.until(lambda: len(alone) == 2)
     assert [event.message for event in alone] == [pose(), pose("t2")]
-    assert together == [HeardMany(MARKS, [("marks/0/7/a0.1", marks("a0.1", 7))])]
-    world.until(lambda: b.counts["payloads_dropped"] == 4)
-    b.gather()
+    together: list[object] = []
+
+    def all_have_come() -> bool:
+        b.gather()
+        together.extend(b.collected_together(MARKS))
+        return b.counts["payloads_dropped"] == 4
+
+    world.until(all_have_come)
+    assert together == [("marks/0/7/a0.1", marks("a0.1", 7))]
     assert [event.message for event in b.collected(TRUE_POSE)] == [pose(), pose("t2")]
     assert b.counts["payloads_misrouted"] == 2  # heard and collected
 
@@ -160,13 +164,12 @@ def serve_cost(bus: ZenohBus) -> list[CostRequest]:
     requests: list[CostRequest] = []
     reply = cost_reply([2.5, float("inf")])
 
-    def post(event: object) -> None:
-        assert isinstance(event, Asked)
+    def post(event: Asked) -> None:
         requests.append(event.request)
         event.answer(reply)
         event.end()
 
-    bus.serve(NAMELESS_COST, post, target="t0")
+    bus.serve(NAMELESS_COST, decoded(post), target="t0")
     return requests
 
 
@@ -211,10 +214,12 @@ def test_a_bad_request_is_refused_in_words_and_counted(world):
     assert (planner.counts["payloads_dropped"], planner.counts["payloads_misrouted"]) == (4, 2)
 
 
-def test_a_question_that_an_inbox_decodes_wakes_no_thread_between(world):
+def test_questions_tokens_and_links_wake_no_thread_between_and_an_inbox_decodes_a_question(world):
     planner, inbox, answers = world.bus("planner"), Inbox(), Box()
     before = threading.enumerate()
-    planner.serve(NAMELESS_COST, inbox.post, undecoded=True, target="t0")
+    planner.serve(NAMELESS_COST, inbox.post, target="t0")
+    planner.watch_alive(Box())
+    planner.watch_links(Box())
     assert threading.enumerate() == before
     a, stranger = world.bus("a"), world.bus("stranger").session
     world.settle()
@@ -378,31 +383,6 @@ def test_a_token_that_names_nobody_is_dropped_and_others_are_still_told(world, t
     raised.undeclare()
 
 
-@pytest.mark.skipif(not Path("/proc/self/task").is_dir(), reason="this system does not count wake-ups in /proc")
-def test_readers_of_what_comes_seldom_sleep_until_it_comes(world):
-    a, b = world.bus("a"), world.bus("b")
-    before = set(threading.enumerate())
-    asked_of, tokens, links = Box(), Box(), Box()
-    b.serve(RUN, asked_of, role="agent", id="b")
-    b.watch_alive(tokens)
-    b.watch_links(links)
-    world.settle()
-    readers = [thread for thread in threading.enumerate() if thread not in before]
-    assert {thread.name for thread in readers} == {"serve-run", "alive", "links"}
-
-    def woken() -> list[int]:
-        statuses = [Path(f"/proc/self/task/{thread.native_id}/status").read_text() for thread in readers]
-        return [int(re.findall(r"^voluntary_ctxt_switches:\s*(\d+)$", text, re.M)[0]) for text in statuses]
-
-    slept = woken()
-    time.sleep(1.0)  # of a channel's `recv` ten wake-ups, fewer on a busy machine
-    assert woken() == slept
-    a.declare_alive(Peer("agent", "a1", 7))
-    a.ask(RUN, Nothing(), Box(), tag="q")
-    world.settle()
-    assert len(asked_of) == len(tokens) == 1
-
-
 def test_a_router_passes_no_payload_which_is_longer_than_its_topic_allows(world):
     a, b, heard, asked_of = world.bus("a").session, world.bus("b").session, [], []
     listening = b.declare_subscriber("*/note/**", heard.append)
@@ -422,7 +402,7 @@ def test_a_router_passes_no_payload_which_is_longer_than_its_topic_allows(world)
 
 def test_a_question_longer_than_its_topic_allows_is_refused_before_it_waits(world):
     bus, waiting = world.bus("a"), []
-    bus.serve(COST, waiting.append, undecoded=True, target="t0")
+    bus.serve(COST, waiting.append, target="t0")
     bus.serve(RUN, waiting.append, role="agent", id="a")
     for topic, key in (
         (COST, "swarm/target/t0/cost/agent.a"),
@@ -445,7 +425,7 @@ class Deaf(Idle):
         self.stopped = True
 
 
-@pytest.mark.parametrize("what", ["sample", "batch", "query", "reply", "end", "token", "link"])
+@pytest.mark.parametrize("what", ["sample", "query", "reply", "end", "token", "link"])
 def test_a_reader_that_dies_ends_the_process_with_its_reason(world, what):
     a, b = world.bus("a"), world.bus("b")
 
@@ -456,7 +436,6 @@ def test_a_reader_that_dies_ends_the_process_with_its_reason(world, what):
 
     listen = {
         "sample": lambda: b.subscribe(POSE, broken),
-        "batch": lambda: b.subscribe(POSE, broken, together=True),
         "query": lambda: b.serve(RUN, broken, role="agent", id="b"),
         "reply": lambda: b.ask(RUN, Nothing(), broken, tag="q"),
         "end": lambda: b.ask(NAMELESS_COST, CostRequest(cells=[1]), broken, tag="q", target="nobody"),

@@ -7,7 +7,7 @@ from typing import Any, Protocol
 
 from support.makers import target_pose
 
-from swarm.bus.bus import Asked, AskEnded, Bus, Event, Replied
+from swarm.bus.bus import Asked, AskEnded, Bus, Event, Post, Replied, Undecoded
 from swarm.wire.messages import Nothing
 from swarm.wire.messages.map_data import MarkSet
 from swarm.wire.messages.planning import TargetPose
@@ -66,23 +66,34 @@ def heard_by(world: World, topic: Topic, **options: Any) -> tuple[Bus, Bus, Box]
 def waiting(world: World, **options: Any) -> tuple[Bus, Bus, Asked, Box]:
     """Two buses, a question of the first that waits for the answer of the second, and what the first hears."""
     a, b, kept, box = world.bus("a"), world.bus("b"), Box(), Box()
-    b.serve(RUN, kept, role="agent", id="b")
+    b.serve(RUN, decoded(kept), role="agent", id="b")
     world.settle()
     a.ask(RUN, Nothing(), box, tag="q", **options)
     world.until(lambda: kept)
     return a, b, kept[0], box
 
 
-def answering(*replies: Any) -> Callable[[Event], None]:
+def decoded(post: Callable[[Any], None]) -> Post:
+    """A `Post` for `serve` that decodes queries, as an inbox does."""
+
+    def decode(event: Event) -> None:
+        if isinstance(event, Undecoded):
+            event = event.decoded()  # type: ignore[assignment]
+        if event is not None:
+            post(event)
+
+    return decode
+
+
+def answering(*replies: Any) -> Post:
     """A `Post` for `serve` that answers with these (message, fields) and ends."""
 
-    def post(event: Event) -> None:
-        assert isinstance(event, Asked)
+    def post(event: Asked) -> None:
         for message, fields in replies:
             event.answer(message, **fields)
         event.end()
 
-    return post
+    return decoded(post)
 
 
 def asked(world: World, bus: Bus, topic: Topic, request: Any, **options: Any) -> Box:

@@ -9,7 +9,7 @@ from functools import partial
 from support.traffic_world import MS, NS_PER_S, TICK_NS, Disk, Faults, Process, TrafficWorld
 
 from swarm.right_of_way.agent_core import Action, OwnRecord, RightOfWay
-from swarm.right_of_way.external_vehicle import ExternalAction, ExternalVehicle, Removal, SaveGenerations
+from swarm.right_of_way.external_vehicle import ExternalAction, ExternalVehicle, Removal
 from swarm.right_of_way.holdings import Tell
 from swarm.right_of_way.host import AskKnown
 from swarm.wire.messages.traffic import Granted, Known, KnownRequest, Left
@@ -50,7 +50,8 @@ class ExternalProcess(Process):
     def begin(self) -> None:
         if not self.external.needs_generation:
             self.try_to_enter()
-        self.do(self.external.begin(self.world.chance.getrandbits(32)))
+        if generations := self.external.begin(self.world.chance.getrandbits(32)):
+            self.disk.own = OwnRecord(disk=self.disk.own.disk, generations=generations)
 
     def try_to_enter(self) -> None:
         """Tries the cell of the body; a body without a cell tries here and there."""
@@ -60,8 +61,6 @@ class ExternalProcess(Process):
     def do(self, actions: list[ExternalAction]) -> None:
         for action in actions:
             match action:
-                case SaveGenerations(generations):
-                    self.disk.own = OwnRecord(disk=self.disk.own.disk, generations=generations)
                 case AskKnown():
                     self.world.begin(self)
                 case Tell() | Left():

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import pytest
-from support.bus_world import Box, World, answering, asked, marks, waiting
+from support.bus_world import Box, World, answering, asked, decoded, marks, waiting
 from support.makers import run_info
 
 from swarm.bus.bus import AskEnded, Event, Replied, meant_for
@@ -78,7 +78,7 @@ def test_the_asked_fields_tell_what_was_asked_and_the_request_arrives(world: Wor
         seen(event)
         answering()(event)
 
-    b.serve(MARKS, post, author="x.1")
+    b.serve(MARKS, decoded(post), author="x.1")
     world.settle()
     asked(world, a, MARKS, MarksRequest(tiles=[7]), tile=7)
     assert seen[0].fields == {"region": "*", "tile": "7", "author": "*"}
@@ -104,7 +104,7 @@ def test_a_query_that_is_never_ended_times_out_with_what_came(world: World):
         event.answer(run_info(id="b"))
         kept(event)
 
-    b.serve(RUN, forget, role="agent", id="b")
+    b.serve(RUN, decoded(forget), role="agent", id="b")
     world.settle()
     box = asked(world, a, RUN, Nothing(), timeout_s=0.3)
     assert [event.message.id for event in box.of(Replied)] == ["b"]

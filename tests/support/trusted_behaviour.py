@@ -5,7 +5,7 @@ A world's `bus` takes an `authenticator`.
 
 from __future__ import annotations
 
-from support.bus_world import Box, answering, asked, marks
+from support.bus_world import Box, answering, asked, decoded, marks
 
 from swarm.bus.bus import Asked, AskEnded, Replied
 from swarm.wire.access import Authenticator
@@ -46,7 +46,7 @@ def test_only_who_knows_the_secret_of_the_run_is_heard(world):
 def test_of_marks_heard_together_only_those_count_whose_sender_knows_the_secret(world):
     ours, hears, stranger = world.bus("o", authenticator=OURS), world.bus("h", authenticator=OURS), world.bus("s")
     box, ticks = Box(), Box()
-    hears.subscribe(MARKS, box, together=True)
+    hears.subscribe(MARKS, box)
     hears.collect(MARKS)
     for bus, author in ((stranger, "operator.z"), (stranger, "all.r1.1"), (ours, "all.r2.1")):
         bus.serve(MARKS, answering((marks(author, 0), {"region": 0, "tile": 0})), author=author)
@@ -59,9 +59,7 @@ def test_of_marks_heard_together_only_those_count_whose_sender_knows_the_secret(
         ticks.extend(hears.collected_together(MARKS))
         return {message.author for _, message in ticks}
 
-    world.until(
-        lambda: {message.author for each in box for _, message in each.samples} == authors() == {"all.r2.1"}
-    )
+    world.until(lambda: {event.message.author for event in box} == authors() == {"all.r2.1"})
     replies = asked(world, hears, MARKS, MarksRequest()).of(Replied)
     assert [each.message.author for each in replies] == ["all.r2.1"]
     assert len(asked(world, stranger, MARKS, MarksRequest()).of(Replied)) == 3  # reading needs no secret
@@ -74,7 +72,7 @@ def test_a_question_without_the_secret_is_refused(world):
         served.append(event)
         answering((table(), {}))(event)
 
-    world.bus("serves", authenticator=OURS).serve(TABLE, post, shard=0, member="a1", agent="a0")
+    world.bus("serves", authenticator=OURS).serve(TABLE, decoded(post), shard=0, member="a1", agent="a0")
     stranger, ours = world.bus("stranger"), world.bus("ours", authenticator=OURS)
     world.settle()
     box = asked(world, stranger, TABLE, Claim(epoch=3), shard=0, member="a1", agent="a0")

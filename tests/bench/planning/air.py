@@ -38,8 +38,7 @@ def air(
     dem: Annotated[str, typer.Option(help="A built-in terrain, or an elevation file.")] = "jacksboro",
     cells: Annotated[int, typer.Option(min=16, max=160, help="A side of the crop.")] = 100,
     grade: Annotated[
-        float | None,
-        typer.Option(min=0.001, max=2.0, help="Steepest rise of the surface; by relief if not given."),
+        float | None, typer.Option(min=0.001, max=2.0, help="Steepest rise of the surface; by relief if not given.")
     ] = None,
     routes: Annotated[int, typer.Option(min=1, help="Routes whose clearance is looked at.")] = 100_000,
     seed: Seed = 1,

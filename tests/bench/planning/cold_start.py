@@ -15,11 +15,7 @@ from bench.isolated import isolated
 from bench.planning.first_use import first_use
 from planner_service.kernels.decorators import KERNELS
 
-STAGES = {
-    "tree": "first tree, one process",
-    "route": "planner's first route",
-    "kernels": "planner has all kernels",
-}
+STAGES = {"tree": "first tree, one process", "route": "planner's first route", "kernels": "planner has all kernels"}
 
 
 @benchmark()

@@ -130,9 +130,7 @@ def base_of(sizes: Sequence[int], targets: Sequence[int], vehicles: Sequence[int
     return min(sizes), sorted(targets)[len(targets) // 2], sorted(vehicles)[len(vehicles) // 2]
 
 
-@benchmark(
-    columns=("size", "targets", "vehicles", "strategy", "frame_ms_mean", "gap_p95", "proven_p95", "frames"),
-)
+@benchmark(columns=("size", "targets", "vehicles", "strategy", "frame_ms_mean", "gap_p95", "proven_p95", "frames"))
 def scale(
     sizes: Annotated[str, typer.Option(help="Cells a side, several with commas.")] = "512,1024,2048",
     targets: Annotated[str, typer.Option(help="Numbers of targets.")] = "1,10,100",

@@ -75,10 +75,7 @@ def simulate(fields: dict[str, Any], seconds: float, limit_s: float) -> dict[str
         "deliveries_per_s": messages.total() / passed_s if passed_s else None,
         "bytes_in_per_s": payloads.total() / passed_s if passed_s else None,
         "topics": {
-            topic: {
-                "deliveries_per_s": messages[topic] / passed_s,
-                "bytes_per_s": size_bytes / passed_s,
-            }
+            topic: {"deliveries_per_s": messages[topic] / passed_s, "bytes_per_s": size_bytes / passed_s}
             for topic, size_bytes in payloads.most_common()
             if passed_s
         },

@@ -110,8 +110,7 @@ def swarm(
         int | None, typer.Option(help="Cells a side.", show_default="262 cells for each vehicle")
     ] = None,
     seconds: Annotated[
-        float | None,
-        typer.Option(min=1, max=3600, help="How long to measure.", show_default="30, simulated 10"),
+        float | None, typer.Option(min=1, max=3600, help="How long to measure.", show_default="30, simulated 10")
     ] = None,
     simulated: Annotated[bool, typer.Option("--simulated", help="One process on a manual clock.")] = False,
 ) -> dict[str, Any]:

@@ -112,7 +112,7 @@ _LONGEST_S = 20
 def latency(far: Far, marks: int) -> dict[str, float]:
     """Microseconds from the put of a mark until another process's cost map has it, beside a raw put of the same
     bytes until a thread there has them. Both take turns in changing order."""
-    peer = far.start(map_peer)
+    peer = far.start(map_peer, True)
     with open_bus(far.network, authenticator=CODES) as bus:
         replica = MapReplica(GRID, author=_AUTHOR, publish_hz=1e6)
         put_ns: dict[tuple[int, int], int] = {}  # (tile, seq) -> when

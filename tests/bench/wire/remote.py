@@ -32,6 +32,7 @@ from swarm.runtime.stats import Counters
 from swarm.wire.access import Authenticator
 from swarm.wire.codec import encode
 from swarm.wire.messages.map_data import MarkSet
+from swarm.wire.topics import MARKS
 
 RAW = "raw/bench"
 """Keys of the raw measurements: as long and as many as ours, without subscribers of ours."""
@@ -106,11 +107,18 @@ def _map_service(sync: MapSync, pipe: Connection) -> Parts:
         sync.start(now_ns)
         pipe.send("ready")
 
-    return Parts(start, sync.on_map_event, sync.tick)
+    def handle(event: Event, now_ns: int) -> None:
+        sync.on_map_event(event, now_ns)
+        sync.take_in(now_ns)
+
+    return Parts(start, handle, sync.tick)
 
 
-def map_peer(network: NetworkConfig, pipe: Connection) -> None:
-    """Applies sets to a cost map and notes the times; receives raw samples beside them."""
+def map_peer(network: NetworkConfig, pipe: Connection, wakes: bool = False) -> None:
+    """Applies sets to a cost map and notes the times; receives raw samples beside them.
+
+    wakes  each set wakes the loop, which else takes in what has come at its next tick
+    """
     applied: list[tuple[int, int, int]] = []  # (tile, seq, when)
     raw_ns: list[int] = []
     cpu_ns: dict[str, int] = {}
@@ -139,6 +147,8 @@ def map_peer(network: NetworkConfig, pipe: Connection) -> None:
         inbox = Inbox()
         replica = MapReplica(GRID, CostMap(terrain_of_pace(np.ones((GRID.rows, GRID.cols), np.float32))))
         sync = MapSync(replica, bus, inbox.post, MapConfig(), "bench", on_accepted=accepted)
+        if wakes:
+            bus.subscribe(MARKS, inbox.post)
         raw = bus.session.declare_subscriber(f"{RAW}/**", zenoh.handlers.FifoChannel(1 << 16))
         kept = read_on_thread(raw, received)
         run_service(_map_service(sync, pipe), bus, inbox, pipe, answer)

@@ -34,7 +34,7 @@ def test_a_reader_that_uses_the_map_at_its_ticks_merges_then_or_when_it_is_asked
     replica = MapReplica(swarm.terrain.grid, Composite())
     reader = swarm.start(
         "p",
-        lambda bus, post: SyncService(MapSync(replica, bus, post, swarm.scenario.map, "planner", at_ticks=True)),
+        lambda bus, post: SyncService(MapSync(replica, bus, post, swarm.scenario.map, "planner")),
         hz=1.0,
         phase_ns=NS_PER_S,
     )

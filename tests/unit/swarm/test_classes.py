@@ -20,20 +20,18 @@ name = "same"
 """
 
 
-def test_a_class_is_what_it_says_over_its_preset_over_the_common_cost() -> None:
+def test_a_class_is_what_it_says_over_its_preset_over_the_common_cost_or_the_scenario_itself() -> None:
     scenario = parse_scenario(_TWO)
     walker = of_class(scenario, "walker")
     assert (walker.cost.slope_rule, walker.cost.max_slope_deg, walker.cost.slope_table) == ("tobler", 40.0, ())
     speeds = walker.cost.flat_speed_m_per_s, walker.cost.road_speed_m_per_s, walker.cost.top_speed_m_per_s
     assert speeds == (0.5, 0.5, 0.5)
     assert walker.cost.class_factor == {"rock": 1.25}
-
-
-def test_a_class_that_says_nothing_is_the_scenario_itself() -> None:
-    scenario = parse_scenario(_TWO)
     assert of_class(scenario, "ground") is scenario
     assert of_class(scenario, "same") == scenario
     assert parse_scenario("").classes == ()
+    with pytest.raises(ConfigError, match=r"has no class 'boat'.*ground"):
+        of_class(Scenario(), "boat")
 
 
 def test_a_written_scenario_has_the_same_classes(tmp_path: Path) -> None:
@@ -50,8 +48,3 @@ def test_classes_keep_the_preset_of_the_common_cost() -> None:
     cost = of_class(scenario, "slow").cost
     assert cost.max_slope_deg == cost_of_preset("wheeled").max_slope_deg
     assert cost.vehicle_radius_m == 1
-
-
-def test_an_unknown_class_is_said_with_those_there_are() -> None:
-    with pytest.raises(ConfigError, match=r"has no class 'boat'.*ground"):
-        of_class(Scenario(), "boat")

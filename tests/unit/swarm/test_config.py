@@ -7,7 +7,7 @@ from typing import get_args, get_type_hints
 import pytest
 
 from swarm.config.explain import meanings
-from swarm.config.scenario import Scenario, crew_of, plan_agents
+from swarm.config.scenario import Scenario, crew_of, ids_of, plan_agents
 from swarm.config.setting_types import Section
 from swarm.config.toml_files import load_scenario, parse_scenario, read_scenario
 from swarm.errors import ConfigError
@@ -40,6 +40,8 @@ def test_an_empty_scenario_is_a_whole_one():
     assert scenario == Scenario()
     assert scenario.target_ids == ["t"]
     assert scenario.vehicle_count == 100
+    (several,) = parse_scenario("[[targets]]\nname = 'x'\ncount = 2\nstart = [3, 4]\nspeed_m_per_s = 2").targets
+    assert (several.start, several.speed_m_per_s, ids_of(several)) == ((3, 4), 2.0, ["x0", "x1"])
 
 
 def test_a_run_needs_each_keeper_whose_name_its_routers_admit():
@@ -100,13 +102,6 @@ def test_agents_take_so_many_vehicles_each_and_one_group():
     ids = [id for agent in agents for id in agent.vehicle_ids]
     assert len(set(ids)) == scenario.vehicle_count
     assert ids[4] == "a1-00"
-
-
-def test_a_scenario_comes_through_a_file_unchanged():
-    scenario = parse_scenario("[[targets]]\nname = 'x'\ncount = 2\nstart = [3, 4]\nspeed_m_per_s = 2")
-    assert scenario.targets[0].start == (3, 4)
-    assert scenario.targets[0].speed_m_per_s == 2.0
-    assert scenario.target_ids == ["x0", "x1"]
 
 
 def sections_of(kind: type) -> set[type[Section]]:

@@ -54,10 +54,7 @@ def test_modules_load_beside_a_loop_that_asks_for_them(module: str) -> None:
 
 
 def test_a_module_that_cannot_be_loaded_is_an_error_of_the_start_that_waits_for_it() -> None:
-    with (
-        mock.patch.object(threading, "excepthook"),
-        pytest.raises(ModuleNotFoundError, match="no_such_module"),
-    ):
+    with mock.patch.object(threading, "excepthook"), pytest.raises(ModuleNotFoundError, match="no_such_module"):
         Modules(["no_such_module"]).wait()
 
 

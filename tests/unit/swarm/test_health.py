@@ -8,14 +8,16 @@ import threading
 import time
 from collections.abc import Iterator
 from pathlib import Path
+from unittest.mock import Mock
 
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from support.dummy_roles import Idle
 from support.makers import run_info
 from support.swarm_model import LossyLinks
 
-from swarm.bus.bus import AskEnded, Event, LinkChanged
+from swarm.bus.bus import AskEnded, LinkChanged
 from swarm.bus.memory_bus import MemoryNetwork
 from swarm.bus.scheduler import Scheduler
 from swarm.clock import ManualClock, MonotonicClock
@@ -24,7 +26,7 @@ from swarm.runtime.inbox import Inbox
 from swarm.runtime.loop_health import Board, Health, Phase, Supervisor, Vitals, supervisor_of
 from swarm.runtime.membership import Member
 from swarm.runtime.process import Process
-from swarm.runtime.stats import READY, Counters
+from swarm.runtime.stats import READY
 from swarm.wire.topics import RUN
 
 
@@ -80,26 +82,20 @@ def test_nothing_was_written_where_there_are_zeros_or_rubbish() -> None:
     assert Board(bytearray(os.urandom(loop_health.BOARD_BYTES))).read() is None
 
 
-class Sleepy:
+class Sleepy(Idle):
     """A service whose tick hangs on request."""
 
     def __init__(self) -> None:
-        self.counters = Counters()
+        super().__init__()
         self.hang, self.wake = threading.Event(), threading.Event()
         self.needs: list[str] = ["a bed"]
 
     def lacks(self) -> list[str]:
         return self.needs
 
-    def start(self, now_ns: int) -> None: ...
-
-    def handle(self, event: Event, now_ns: int) -> None: ...
-
     def tick(self, now_ns: int) -> None:
         if self.hang.is_set():
             self.wake.wait(60)
-
-    def stop(self, now_ns: int) -> None: ...
 
 
 @contextlib.contextmanager
@@ -227,18 +223,11 @@ def test_a_name_in_the_abstract_namespace_is_a_manager_too() -> None:
 
 @given(st.text(max_size=300))
 def test_no_text_makes_a_word_of_its_own(text: str) -> None:
-    reading, writing = socket.socketpair(socket.AF_UNIX, socket.SOCK_DGRAM)
-    with reading, writing:
-        supervisor = Supervisor(None)
-        supervisor._address = "@nowhere"
-
-        class Sent:
-            def sendto(self, content: bytes, address: str) -> None:
-                writing.send(content)
-
-        supervisor._socket = Sent()
-        supervisor.says(text)
-        assert reading.recv(4096).count(b"\n") == 0
+    supervisor = Supervisor(None)
+    supervisor._address, supervisor._socket = "@nowhere", Mock()
+    supervisor.says(text)
+    (sent, _), _ = supervisor._socket.sendto.call_args
+    assert sent.count(b"\n") == 0
 
 
 @pytest.mark.parametrize(

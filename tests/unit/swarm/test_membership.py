@@ -9,7 +9,7 @@ from swarm.bus.bus import Event, LinkChanged
 from swarm.errors import RunMismatchError
 from swarm.grid import GridSpec
 from swarm.peers import Peer
-from swarm.runtime.membership import NO_RUN, Member, check_belongs, check_same_run
+from swarm.runtime.membership import NO_RUN, Member, check_belongs
 from swarm.wire.topics import NOTE, RUN, STATS
 
 INFO = run_info(
@@ -55,6 +55,7 @@ def world() -> SwarmModel:
         [{"id": id} for id in ("t0", "t1", "t2")],
         [{"id": f"t{wire}", "wire_version": wire} for wire in (8, 9)],  # neighbouring builds
         [ROUTER, {"id": "t0"}, {"id": "t1"}],  # a router belongs to no run
+        [{"id": "t0"}, {"role": "agent", "id": "a0", "incarnation": 9, "started_ns": 5}],
     ],
 )
 def test_members_of_one_run_get_along(members, world):
@@ -97,10 +98,6 @@ def test_one_that_does_not_belong_ends_with_a_sentence_and_the_others_go_on(chan
     assert str(stranger.failure).startswith(words)
     assert stranger.failure.exit_code == 5
     assert first.failure is None
-
-
-def test_a_process_that_does_not_say_its_wire_version_speaks_the_last_one_before_any_said_it():
-    assert INFO.wire_version == 8
 
 
 def test_a_router_that_answers_first_hides_no_other_run():
@@ -161,10 +158,6 @@ def test_counters_are_told_once_a_second_and_at_the_end():
     assert last.counts["marks"] == 3
     assert last.counts["messages_out"] >= 3
     assert sum(last.histograms["tick_ms"].values()) == 1
-
-
-def test_the_same_run_from_anywhere_is_the_same_run():
-    check_same_run(INFO, msgspec.structs.replace(INFO, role="agent", id="a0", incarnation=9, started_ns=5))
 
 
 def test_once_somebody_has_confirmed_a_process_no_false_answer_ends_it_and_the_stranger_is_named_once():

@@ -1,21 +1,9 @@
 """The set of live processes does not depend on the order of the messages about it."""
 
-import random
-
 from hypothesis import given
 from hypothesis import strategies as st
 
 from swarm.peers import SILENCE_NS, Leases, Newest, Peer, Roster
-
-
-def test_a_new_incarnation_may_appear_before_the_old_one_is_gone():
-    roster = Roster()
-    roster.appeared(Peer("planner", "t0", 1))
-    roster.appeared(Peer("planner", "t0", 2))
-    roster.gone(Peer("planner", "t0", 1))
-    assert roster.alive("planner") == {"t0": 2}
-    roster.gone(Peer("planner", "t0", 2))
-    assert not roster.is_alive("planner", "t0")
 
 
 def test_however_many_tokens_one_process_raises_only_its_newest_are_kept() -> None:
@@ -28,30 +16,21 @@ def test_however_many_tokens_one_process_raises_only_its_newest_are_kept() -> No
     assert not roster.is_alive("agent", "a0")
 
 
-def test_the_newest_incarnation_counts_and_roles_are_apart():
-    roster = Roster()
-    for peer in (Peer("agent", "a1", 5), Peer("agent", "a0", 9), Peer("agent", "a0", 3), Peer("keeper", "a0", 99)):
-        roster.appeared(peer)
-    assert list(roster.alive("agent").items()) == [("a0", 9), ("a1", 5)]
-
-
 peers = st.builds(Peer, st.sampled_from(["agent", "planner"]), st.sampled_from(["x", "y"]), st.integers(1, 3))
 
 
-@given(st.lists(peers, max_size=12), st.randoms(use_true_random=False))
-def test_repetition_and_order_of_tokens_do_not_matter(appeared, chance: random.Random):
-    one, other = Roster(), Roster()
-    for peer in appeared:
-        one.appeared(peer)
-    shuffled = appeared * 2
-    chance.shuffle(shuffled)
-    for peer in shuffled:
-        other.appeared(peer)
-    for role in ("agent", "planner"):
-        assert list(one.alive(role).items()) == list(other.alive(role).items())
-    for peer in shuffled:
-        other.gone(peer)
-    assert other.alive("agent") == other.alive("planner") == {}
+@given(st.lists(st.tuples(st.booleans(), peers), max_size=30))
+def test_of_each_role_the_newest_incarnations_whose_tokens_are_up_are_alive(tokens: list[tuple[bool, Peer]]):
+    """One may appear before the last one is gone, and tokens that repeat or were never up change nothing."""
+    roster, up = Roster(), set[Peer]()
+    for rises, peer in tokens:
+        (roster.appeared if rises else roster.gone)(peer)
+        (up.add if rises else up.discard)(peer)
+        for role in ("agent", "planner"):
+            alive = {each.id: each.incarnation for each in sorted(up) if each.role == role}
+            assert list(roster.alive(role).items()) == list(alive.items())
+            assert [id for id in "xy" if roster.is_alive(role, id)] == list(alive)
+        assert roster.up() == sorted({(each.role, each.id) for each in up})
 
 
 def test_a_lease_runs_out_once_and_a_word_renews_it():

@@ -69,15 +69,11 @@ def sensor(name: str, **options: object) -> NamedPlugin:
     return NamedPlugin(PLUGIN_KINDS["sensor"], "vehicles.sensor", name, options)
 
 
-def test_a_module_beside_the_scenario_is_found_and_its_options_become_its_struct(folder: Path) -> None:
+def test_a_module_beside_the_scenario_is_found_and_options_become_its_struct_or_stay_a_table(folder: Path) -> None:
     scenario = folder / "scenario.toml"
     scenario.write_text("[vehicles]\nsensor = 'eyes:Wide'\nsensor_options = { reach_cells = 9 }")
-    plugin = named_plugin(load_scenario(scenario), "vehicles.sensor")
-    made = plugin.make("world")
+    made = named_plugin(load_scenario(scenario), "vehicles.sensor").make("world")
     assert (made.world, made.look([])) == ("world", 9)
-
-
-def test_options_become_a_struct_or_stay_a_table_and_what_is_made_already_is_taken(folder: Path) -> None:
     assert find_plugin(sensor("eyes:Loose", share=1), str(folder)).options.share == 1.0
     assert find_plugin(sensor("eyes:Free", any=[1, {}]), str(folder)).make(None).look([]) == {"any": [1, {}]}
     assert find_plugin(sensor("eyes:MADE"), str(folder)).make(None).look([5]) == [5]
@@ -227,8 +223,7 @@ def test_an_alarm_leaves_that_of_others_as_it_was() -> None:
 
 
 @pytest.mark.parametrize(
-    "hangs",
-    ["return sum(repeat(0))", "while True:\n        with suppress(BaseException): time.sleep(30)"],
+    "hangs", ["return sum(repeat(0))", "while True:\n        with suppress(BaseException): time.sleep(30)"]
 )
 def test_a_call_that_no_alarm_ends_kills_the_process_and_leaves_its_line(hangs: str, tmp_path: Path) -> None:
     """Native code does not come back, and other code swallows the alarm."""

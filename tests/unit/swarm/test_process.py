@@ -26,25 +26,40 @@ def note(text: str) -> Heard:
 
 
 class Recording:
-    """A service that writes down what happens to it; `on_tick` may do more."""
+    """A service that writes down what happens to it, whose loop runs until its end or a number of ticks.
 
-    def __init__(self, on_tick=lambda ticks: None, on_event=lambda event: None) -> None:
+    waiting   number of notes in the inbox when it starts, each of which takes `event_ms`
+    """
+
+    def __init__(self, on_tick=lambda tick: None, until=0, *, clock=None, waiting=0, event_ms=1, phase=None, hz=10):
         self.counters = Counters()
         self.log: list[object] = []
         self.ticks: list[int] = []
-        self._on_tick = on_tick
-        self._on_event = on_event
+        self._on_tick, self._until, self._event_ms = on_tick, until, event_ms
+        self.clock, inbox = clock or ManualClock(), Inbox()
+        for n in range(waiting):
+            inbox.post(note(str(n)))
+        self.process = Process(self, inbox, self.clock, hz, phase)
+
+    def run(self) -> "Recording":
+        self.process.run()
+        return self
+
+    def takes(self, ms: int) -> None:
+        self.clock.advance_to(self.clock.now_ns() + ms * 1_000_000)
 
     def start(self, now_ns: int) -> None:
         self.log.append("start")
 
     def handle(self, event: Event, now_ns: int) -> None:
         self.log.append(event)
-        self._on_event(event)
+        self.takes(self._event_ms)
 
     def tick(self, now_ns: int) -> None:
         self.ticks.append(now_ns)
-        self._on_tick(self.ticks)
+        self._on_tick(len(self.ticks))
+        if len(self.ticks) == self._until:
+            self.process.stop()
 
     def stop(self, now_ns: int) -> None:
         self.log.append("stop")
@@ -52,17 +67,8 @@ class Recording:
 
 @pytest.mark.parametrize(("took_ms", "late"), [(149, 0), (151, 1), (250, 1), (260, 2), (360, 3)])
 def test_a_tick_is_late_which_comes_more_than_half_a_period_after_it_was_due_or_never(took_ms, late):
-    clock, inbox = ManualClock(), Inbox()
-
-    def on_tick(ticks: list[int]) -> None:
-        if len(ticks) == 2:
-            process.stop()
-        else:
-            clock.advance_to(clock.now_ns() + took_ms * 1_000_000)
-
-    service = Recording(on_tick)
-    process = Process(service, inbox, clock, tick_hz=10)
-    process.run()
+    service = Recording(lambda tick: service.takes(took_ms if tick == 1 else 0), until=2)
+    service.run()
     assert service.counters.counts["ticks_late"] == late
     assert service.counters.counts["ticks_dropped"] == (took_ms - 100) // 100
 
@@ -78,18 +84,11 @@ def test_ticks_of_processes_with_successive_ids_lie_spread_over_the_period(first
 
 @pytest.mark.parametrize("start_ms", [0, 29, 31, 99, 1_700_000_000_030])
 def test_ticks_fall_where_the_phase_says_whenever_the_process_starts_and_however_late_one_is(start_ms):
-    clock, inbox = ManualClock(start_ms * 10**6), Inbox()
-    for n in range(1000):
-        inbox.post(note(str(n)))  # what else makes the time pass
-
-    def on_tick(ticks: list[int]) -> None:
-        clock.advance_to(clock.now_ns() + (130_000_000 if len(ticks) == 2 else 0))
-        if len(ticks) == 5:
-            process.stop()
-
-    service = Recording(on_tick, lambda event: clock.advance_to(clock.now_ns() + 1_000_000))
-    process = Process(service, inbox, clock, tick_hz=10, phase=0.3)
-    process.run()
+    service = Recording(
+        lambda tick: service.takes(130 if tick == 2 else 0),
+        until=5, clock=ManualClock(start_ms * 10**6), waiting=1000, phase=0.3,
+    )  # fmt: skip
+    service.run()
     assert service.ticks[0] // 10**6 == start_ms  # at once
     next_ms = start_ms + 1 + (29 - start_ms) % 100
     # The second takes 130 ms, and waiting events get as long: one is late, and those after it are not.
@@ -97,47 +96,27 @@ def test_ticks_fall_where_the_phase_says_whenever_the_process_starts_and_however
 
 
 def test_events_are_handled_between_ticks_and_ticks_come_though_the_inbox_is_full():
-    clock, inbox = ManualClock(), Inbox()
-    for n in range(50):
-        inbox.post(note(str(n)))
-
-    def on_event(event: Event) -> None:
-        clock.advance_to(clock.now_ns() + 10_000_000)
-        if event == note("49"):
-            process.stop()
-
-    service = Recording(on_event=on_event)
-    process = Process(service, inbox, clock, tick_hz=10)
-    process.run()
-    assert [tick // 10**6 for tick in service.ticks] == [0, 100, 200, 300, 400]
-    assert len(service.log) == 52
+    service = Recording(until=6, waiting=50, event_ms=10).run()
+    assert [tick // 10**6 for tick in service.ticks] == [0, 100, 200, 300, 400, 500]
+    assert service.log == ["start", *(note(str(n)) for n in range(50)), "stop"]
 
 
 def test_ticks_that_take_longer_than_their_period_leave_events_as_much_time_as_they_take():
-    clock, inbox = ManualClock(), Inbox()
     handled_before_tick: list[int] = []
 
-    def on_tick(ticks):
+    def on_tick(tick: int) -> None:
         handled_before_tick.append(sum(isinstance(each, Heard) for each in service.log))
-        clock.advance_to(clock.now_ns() + 150_000_000)  # one and a half periods
-        if len(ticks) == 5:
-            process.stop()
+        service.takes(150)  # one and a half periods
 
-    service = Recording(on_tick, lambda event: clock.advance_to(clock.now_ns() + 1_000_000))
-    process = Process(service, inbox, clock, 10.0)
-    for n in range(1000):
-        inbox.post(note(str(n)))
-    process.run()
+    service = Recording(on_tick, until=5, waiting=1000)
+    service.run()
     assert np.diff(handled_before_tick).tolist() == [150] * 4
 
 
 def test_a_service_that_raises_is_stopped_and_the_error_goes_on():
-    def on_tick(ticks: list[int]) -> None:
-        raise ValueError("bug")
-
-    service = Recording(on_tick)
+    service = Recording(lambda tick: int("bug"))
     with pytest.raises(ValueError, match="bug"):
-        Process(service, Inbox(), ManualClock(), tick_hz=10).run()
+        service.run()
     assert service.log == ["start", "stop"]
 
 
@@ -183,29 +162,24 @@ def test_closing_a_worker_waits_for_no_job_and_begins_no_other():
 
 
 def test_a_thread_that_dies_ends_the_process_with_its_error(caplog):
-    def on_tick(ticks: list[int]) -> None:
-        if len(ticks) == 2:
+    def on_tick(tick: int) -> None:
+        if tick == 2:
             threading.Thread(target=lambda: [][1], name="reader").start()
 
-    service, before = Recording(on_tick), threading.excepthook
+    service, before = Recording(on_tick, clock=MonotonicClock(), hz=50), threading.excepthook
     with pytest.raises(IndexError, match="out of range"):
-        Process(service, Inbox(), MonotonicClock(), tick_hz=50).run()
+        service.run()
     assert service.log == ["start", "stop"]
     assert "thread reader ended by IndexError: list index out of range" in caplog.text
     assert threading.excepthook is before
 
 
 def test_a_thread_that_leaves_by_sys_exit_ends_nothing():
-    def on_tick(ticks: list[int]) -> None:
-        if len(ticks) == 2:
+    def on_tick(tick: int) -> None:
+        if tick == 2:
             threading.Thread(target=sys.exit).start()
-        if len(ticks) == 6:
-            process.stop()
 
-    service = Recording(on_tick)
-    process = Process(service, Inbox(), MonotonicClock(), tick_hz=50)
-    process.run()
-    assert len(service.ticks) == 6
+    assert len(Recording(on_tick, until=6, clock=MonotonicClock(), hz=50).run().ticks) == 6
 
 
 def test_the_clock_never_runs_backwards():

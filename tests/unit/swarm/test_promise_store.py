@@ -37,15 +37,21 @@ def saved_in(path: Path) -> tuple[OwnRecord, dict[int, tuple[int, Table]]]:
     return store.own, store.saved
 
 
-def test_what_was_saved_is_there_again(tmp_path: Path) -> None:
-    store = FilePromiseStore(tmp_path / "run" / "promises-a0")
+def test_what_was_saved_is_there_again_and_a_second_process_is_refused_and_leaves_no_file_open(
+    tmp_path: Path,
+) -> None:
+    path = tmp_path / "run" / "promises-a0"
+    store, before = FilePromiseStore(path), psutil.Process().num_fds()
+    with pytest.raises(StoreError, match="runs here already"):
+        FilePromiseStore(path)
+    assert psutil.Process().num_fds() == before
     own = OwnRecord(disk=store.own.disk, generations=[7], noted={"a1": 5}, noted_by=["a1"])
     store.save_own(own)
     for seq in range(3):
         store.save(3, table(0, seq))
     store.save(8, table(4, 1))
     store.close()
-    assert saved_in(tmp_path / "run" / "promises-a0") == (own, {0: (3, table(0, 2)), 4: (8, table(4, 1))})
+    assert saved_in(path) == (own, {0: (3, table(0, 2)), 4: (8, table(4, 1))})
 
 
 @pytest.mark.parametrize("gone", ["nothing", "the folder", "its place", "promises-a0.lock", "promises-a0.spare"])
@@ -147,13 +153,6 @@ def test_one_that_waits_goes_on_with_what_the_generation_before_has_left(tmp_pat
     found[0].close()
 
 
-def test_a_second_process_on_the_same_file_is_refused(tmp_path: Path) -> None:
-    store = FilePromiseStore(tmp_path / "promises-a0")
-    with pytest.raises(StoreError, match="runs here already"):
-        FilePromiseStore(tmp_path / "promises-a0")
-    store.close()
-
-
 def test_a_file_that_is_none_of_ours_is_refused_in_words(tmp_path: Path) -> None:
     path = tmp_path / "promises-a0"
     for content in (b"", bytes(4096), (5).to_bytes(4, "little") + b"hello"):
@@ -162,28 +161,18 @@ def test_a_file_that_is_none_of_ours_is_refused_in_words(tmp_path: Path) -> None
             FilePromiseStore(path)
 
 
-def test_a_file_that_is_full_is_written_anew(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(("shards", "grows"), [(3, False), (300, True)])
+def test_a_file_that_is_full_is_written_anew_and_grows_for_what_counts_only(tmp_path, monkeypatch, shards, grows):
     monkeypatch.setattr(promise_store, "_SIZE_BYTES", 3000)
     path = tmp_path / "promises-a0"
     store = FilePromiseStore(path)
-    for seq in range(200):
-        store.save(3, table(seq % 3, seq))
-        assert path.stat().st_size == 3000
+    for seq in range(300):
+        store.save(3, table(seq % shards, seq))
+        assert grows or path.stat().st_size == 3000
         assert store.ready
     store.close()
     _, found = saved_in(path)
-    assert {shard: saved.seq for shard, (_, saved) in found.items()} == {0: 198, 1: 199, 2: 197}
-
-
-def test_what_counts_may_grow_beyond_the_size_that_a_file_begins_with(tmp_path, monkeypatch):
-    monkeypatch.setattr(promise_store, "_SIZE_BYTES", 2000)
-    store = FilePromiseStore(tmp_path / "promises-a0")
-    for shard in range(300):
-        store.save(3, table(shard, shard))
-        assert store.ready
-    store.close()
-    _, found = saved_in(tmp_path / "promises-a0")
-    assert {shard: saved.seq for shard, (_, saved) in found.items()} == {n: n for n in range(300)}
+    assert {shard: saved.seq for shard, (_, saved) in found.items()} == {seq % shards: seq for seq in range(300)}
 
 
 class Disk:
@@ -251,12 +240,3 @@ def test_members_are_told_of_an_agent_whose_certificate_is_revoked_and_of_its_ne
         simulation.run_until(4.0 * (looks + 1))
         assert told == ["a0"] * looks * len(agents(simulation))
         names.append(new)
-
-
-def test_a_refused_store_leaves_no_file_open(tmp_path: Path) -> None:
-    store = FilePromiseStore(tmp_path / "promises-a0")
-    before = psutil.Process().num_fds()
-    with pytest.raises(StoreError, match="in use"):
-        FilePromiseStore(tmp_path / "promises-a0")
-    assert psutil.Process().num_fds() == before
-    store.close()

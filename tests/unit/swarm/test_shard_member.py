@@ -10,8 +10,8 @@ from swarm.wire.fields import MOST_IDS
 from swarm.wire.messages.traffic import Granted, Held, Stand, Stored, Table
 
 
-def member_of(promised: int = 0) -> Member:
-    return Member(SHARDS, MEMBERS[0], promised, table_of(0, 0), {}, 0, near_members())
+def member_of(n: int = 0, promised: int = 0) -> Member:
+    return Member(SHARDS, MEMBERS[n], promised, table_of(0, 0), {}, 0, near_members())
 
 
 def test_after_a_promise_nothing_older_is_stored() -> None:
@@ -27,9 +27,7 @@ def test_after_a_promise_nothing_older_is_stored() -> None:
 
 
 def test_the_second_member_says_what_the_first_has_not_said_and_something_in_each_heartbeat() -> None:
-    first, second = (
-        Member(SHARDS, MEMBERS[n], 0, table_of(0, 0), {}, 0, near_members()) for n in (2, 0)
-    )  # of epoch 1
+    first, second = member_of(2), member_of(0)  # of epoch 1
     said = first.hear_table(table_of(1, 1), S)
     assert [type(action) for action in said] == [Save, Stored]
     assert [type(action) for action in second.hear_table(table_of(1, 1), S)] == [Save]
@@ -77,9 +75,7 @@ def test_members_that_answer_are_told_what_has_changed_since_the_table_that_all_
 
 
 def test_changes_are_answered_as_the_table_that_they_stand_for() -> None:
-    first, second = (
-        Member(SHARDS, MEMBERS[n], 0, table_of(0, 0), {}, 0, near_members()) for n in (2, 0)
-    )  # of epoch 1
+    first, second = member_of(2), member_of(0)  # of epoch 1
     tables = [table_of(1, 3, a1=[2]), table_of(1, 4, a0=[1], a1=[2, 3]), table_of(1, 5, a0=[1])]
     tables[2] = replace(tables[2], hosts={**tables[1].hosts, **tables[2].hosts})
     changes = tables[1].changes(tables[0])

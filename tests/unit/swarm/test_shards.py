@@ -13,7 +13,7 @@ from swarm.grid import MAX_CELLS, MOST_SHARD_REGIONS, REGION_CELLS, GridSpec
 from swarm.right_of_way.agent_core import OwnRecord, RightOfWay
 from swarm.right_of_way.shards import MOST_SHARDS_AN_AGENT, Shards, fitting_regions
 from swarm.runtime.role_setup import RoleSetup
-from swarm.wire.messages.traffic import Known, KnownRequest
+from swarm.wire.messages.traffic import Known, KnownRequest, Table
 
 GRID = GridSpec(1100, 1100, 1.0)
 AGENTS = ["a0", "a1", "a2"]
@@ -22,8 +22,8 @@ SPAWNS = {agent: {f"{agent}-00": 9 * n} for n, agent in enumerate(AGENTS)}
 WIDE = 2 * REGION_CELLS
 
 
-def rights(own: OwnRecord, side: int = WIDE) -> RightOfWay:
-    return RightOfWay("a0", Shards(GRID, AGENTS, side), SPAWNS, own, {})
+def rights(own: OwnRecord, side: int = WIDE, saved: dict[int, tuple[int, Table]] | None = None) -> RightOfWay:
+    return RightOfWay("a0", Shards(GRID, AGENTS, side), SPAWNS, own, saved or {})
 
 
 @given(st.integers(1, 20_000), st.integers(1, 20_000), st.integers(1, 500))
@@ -61,6 +61,7 @@ def test_shards_of_one_region_need_no_quorum_and_larger_ones_all_agents_but_two(
     assert [Shards(GRID, FIVE[:n]).majority for n in (1, 2, 3, 5)] == [1, 1, 2, 2]
     assert [Shards(GRID, FIVE[:n], proven=True).majority for n in (1, 2, 3, 4, 5)] == [1, 1, 2, 3, 3]
     assert [Shards(GRID, FIVE, WIDE).has_quorum(FIVE[:n]) for n in range(6)] == 3 * [False] + 3 * [True]
+    assert not Shards(GRID, FIVE[:2], WIDE).has_quorum(FIVE[:1])
 
 
 def test_an_agent_whose_shards_are_of_another_size_gets_no_seat_by_the_others_and_gives_them_none() -> None:
@@ -74,20 +75,17 @@ def test_an_agent_whose_shards_are_of_another_size_gets_no_seat_by_the_others_an
     assert (told.noted_by, told.shard_cells) == (["a1"], WIDE)
 
 
-def test_an_external_vehicle_is_told_how_large_shards_are() -> None:
-    (known,) = rights(OwnRecord(disk=1)).answer_known(KnownRequest(agent="guest", disk=0))
-    assert (known.agents, known.shard_cells) == (AGENTS, WIDE)
-
-
-@pytest.mark.parametrize("used", [{"noted": {"a1": 7}}, {"noted_by": ["a1"]}])
+@pytest.mark.parametrize("used", [{"noted": {"a1": 7}}, {"noted_by": ["a1"]}, {}])
 def test_promises_of_shards_of_another_size_are_refused_with_what_to_do(used: dict[str, object]) -> None:
+    """Also what was promised before a generation began."""
     own = OwnRecord(disk=1, **used)  # type: ignore[arg-type]
-    assert rights(own, REGION_CELLS).own is own
+    saved = {} if used else {0: (3, Table(shard=0, agent="a0", epoch=3, seq=1, hosts={}, grants={}))}
+    assert rights(own, REGION_CELLS, saved).own.shard_cells == REGION_CELLS
     with pytest.raises(
         StoreError, match=r"shards of 256 cells, the scenario has 512: set map\.shard_regions to 1, or"
     ):
-        rights(own)
-    assert rights(replace(own, shard_cells=WIDE)).own.shard_cells == WIDE
+        rights(own, WIDE, saved)
+    assert rights(replace(own, shard_cells=WIDE), WIDE, saved).own.shard_cells == WIDE
 
 
 def test_every_process_says_how_large_shards_are() -> None:
