@@ -68,52 +68,6 @@ def piece_digest(piece: bytes) -> bytes:
     return hashlib.blake2b(piece, digest_size=BASE_DIGEST_BYTES).digest()
 
 
-def _piece(terrain: Terrain, layer: str, region: int) -> bytes:
-    array: NDArray[Any] = getattr(terrain, LAYERS[layer].field)
-    window = region_window(terrain.grid, region)
-    return array[window.row0 : window.row1, window.col0 : window.col1].tobytes()
-
-
-def describe(terrain: Terrain, keeper: str) -> BaseMap:
-    """Returns a keeper's description of its terrain: grid, notes, and the digest of every layer of every region.
-
-    `keeper` is the keeper's id, which a refusal names.
-    """
-    grid = terrain.grid
-    digests = {
-        layer: b"".join(piece_digest(_piece(terrain, layer, region)) for region in range(grid.regions))
-        for layer in LAYERS
-    }
-    return BaseMap(
-        keeper=keeper,
-        terrain=terrain.digest,
-        **asdict(grid),
-        digests=digests,
-        notes=list(terrain.notes),
-    )
-
-
-def pack(terrain: Terrain, layer: str, region: int) -> BaseMapTile:
-    """One layer of one region, packed. zlib, because every process has it; byte planes halve what it leaves of
-    floats.
-
-    Parameters
-    ----------
-    layer : str
-        One of `LAYERS`.
-    region : int
-        0 to grid.regions - 1.
-
-    Raises
-    ------
-    KeyError
-        If there is no such layer.
-    """
-    values = np.frombuffer(_piece(terrain, layer, region), np.uint8)
-    planes = values.reshape(-1, np.dtype(LAYERS[layer].dtype).itemsize).T.tobytes()
-    return BaseMapTile(layer=layer, region=region, data=zlib.compress(planes, _LEVEL))
-
-
 class BaseMapServer:
     """Answers for a terrain, which never changes: so on the bus's own thread, beside the keeper's loop, which a
     large map must not hold up. Pieces are packed once and kept."""
@@ -121,7 +75,7 @@ class BaseMapServer:
     def __init__(self, terrain: Terrain, keeper: str) -> None:
         self._terrain = terrain
         self._keeper = keeper
-        self._packed = lru_cache(_PIECES_KEPT)(self._pack)
+        self._packed = lru_cache(_PIECES_KEPT)(self.pack)
 
     def start(self, bus: Bus) -> None:
         """Serves the description, and pieces."""
@@ -131,7 +85,7 @@ class BaseMapServer:
     def answer_map(self, event: Event) -> None:
         """Answers what the terrain is."""
         assert isinstance(event, Asked)
-        event.answer(self._described)
+        event.answer(self.described)
         event.end()
 
     def answer_tiles(self, event: Event) -> None:
@@ -154,11 +108,28 @@ class BaseMapServer:
         event.end()
 
     @cached_property
-    def _described(self) -> BaseMap:
-        return describe(self._terrain, self._keeper)
+    def described(self) -> BaseMap:
+        """Grid, notes, and the digest of every layer of every region. A refusal names the keeper."""
+        grid = self._terrain.grid
+        digests = {
+            layer: b"".join(piece_digest(self._piece(layer, region)) for region in range(grid.regions))
+            for layer in LAYERS
+        }
+        notes = list(self._terrain.notes)
+        named = {"keeper": self._keeper, "terrain": self._terrain.digest}
+        return BaseMap(**named, **asdict(grid), digests=digests, notes=notes)
 
-    def _pack(self, layer: str, region: int) -> BaseMapTile:
-        return pack(self._terrain, layer, region)
+    def pack(self, layer: str, region: int) -> BaseMapTile:
+        """One of `LAYERS` of one region, packed. zlib, because every process has it; byte planes halve what it
+        leaves of floats."""
+        values = np.frombuffer(self._piece(layer, region), np.uint8)
+        planes = values.reshape(-1, np.dtype(LAYERS[layer].dtype).itemsize).T.tobytes()
+        return BaseMapTile(layer=layer, region=region, data=zlib.compress(planes, _LEVEL))
+
+    def _piece(self, layer: str, region: int) -> bytes:
+        array: NDArray[Any] = getattr(self._terrain, LAYERS[layer].field)
+        window = region_window(self._terrain.grid, region)
+        return array[window.row0 : window.row1, window.col0 : window.col1].tobytes()
 
 
 # --- the side of a process without the files --------------------------------------------------------------------

@@ -41,11 +41,20 @@ def test_a_void_does_not_spread_through_the_levels() -> None:
     assert (level.photo == 128).all()
 
 
-def test_the_commonest_class_stays_and_a_road_as_thin_as_it_is() -> None:
-    terrain = terrain_of_pace(np.ones((4, 4), np.float32))
-    terrain.classes[:2] = [[1, 2, 3, 4], [2, 1, 5, 5]]
-    terrain.classes[3, 0] = TerrainClass.ROAD
-    assert level_of(terrain, 4).classes.tolist() == [[2, 5], [TerrainClass.ROAD, 0]]
+@pytest.mark.parametrize("most", [2500, 50])
+def test_the_commonest_class_stays_and_a_road_as_thin_as_it_is(most: int) -> None:
+    terrain = terrain_of_pace(np.ones((75, 130), np.float32))
+    terrain.classes[:] = np.random.default_rng(2).integers(1, TerrainClass.ROAD, terrain.classes.shape)
+    terrain.classes[40, 50:] = TerrainClass.ROAD
+    level = level_of(terrain, most)
+    for row, col in np.ndindex(level.classes.shape):
+        counts = np.bincount(
+            terrain.classes[row * level.side :, col * level.side :][: level.side, : level.side].flat
+        )
+        expected = (
+            {TerrainClass.ROAD} if len(counts) > TerrainClass.ROAD else np.flatnonzero(counts == counts.max())
+        )
+        assert level.classes[row, col] in expected
 
 
 def test_a_mark_on_one_cell_is_seen_from_afar() -> None:

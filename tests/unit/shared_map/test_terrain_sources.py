@@ -291,6 +291,15 @@ def test_a_bad_raster_is_refused_with_a_sentence(tmp_path, make, words):
     assert "\n" not in str(caught.value)
 
 
+def test_an_array_in_place_of_a_path_is_refused_by_what_to_write(tmp_path: Path) -> None:
+    with pytest.raises(
+        TerrainError, match=r"is of type ndarray, expected a path: numpy\.savez\('heights\.npz', elev"
+    ):
+        build_terrain(Scenario(terrain=TerrainConfig(source=heights())))
+    np.savez(tmp_path / "heights.npz", elevation=heights(), resolution_m=10.0)
+    np.testing.assert_array_equal(load(tmp_path / "heights.npz").elevation_m, heights())
+
+
 def test_a_raster_within_another_file_is_that_raster(tmp_path: Path) -> None:
     plain = load(**dem(tmp_path))
     nested = vrt(tmp_path, vrt(tmp_path, "a.tif", 30, "b.vrt")["source"].name)
