@@ -219,8 +219,9 @@ def class_terrains(scenario: Scenario, common: Terrain, names: Iterable[str] | N
 
 def class_truths(scenario: Scenario, common: Terrain, truth: Floats) -> dict[str, Floats]:
     """Class -> the truth for it, of "ground" and of every class that vehicles of the scenario belong to."""
-    others = {name: _truth(scenario, common, truth, name) for name in driven_classes(scenario)}
-    return {GROUND: truth, **others}
+    return {GROUND: truth} | {
+        name: _ground(scenario, common, truth, name).truth for name in driven_classes(scenario)
+    }
 
 
 def class_grounds(
@@ -232,10 +233,7 @@ def class_grounds(
     """
     known = store.homes_of(common.pace_s_per_m, truth) if homes is None else homes
     grounds = {GROUND: ClassGround(common, truth, known)}
-    for name in driven_classes(scenario):
-        prepared = _KNOWN.get(common, {}).get(_key(scenario, name))
-        grounds[name] = prepared or _ground(scenario, common, truth, name)
-    return grounds
+    return grounds | {name: _ground(scenario, common, truth, name) for name in driven_classes(scenario)}
 
 
 def least_pace(own: ClassConfig | None) -> float:
@@ -246,23 +244,18 @@ def least_pace(own: ClassConfig | None) -> float:
 
 
 def _ground(scenario: Scenario, common: Terrain, truth: Floats, name: str) -> ClassGround:
-    own, own_truth = _terrain(scenario, common, name), _truth(scenario, common, truth, name)
+    prepared = _KNOWN.get(common, {}).get(_key(scenario, name))
+    if prepared is not None:
+        return prepared
+    own = _terrain(scenario, common, name)
+    own_truth = own.ground_s_per_m
+    if own.flight_m is None:  # nothing is hidden in the air
+        priors = own_truth.reshape(-1), common.ground_s_per_m.reshape(-1)
+        own_truth = read_by(*priors, truth.reshape(-1), own.least_s_per_m).reshape(truth.shape)
     homes = store.homes_of(own.pace_s_per_m, own_truth)
     if not homes.any():
         raise TerrainError(f"class {name}: no cell that it can drive by the map is so in truth")
     return ClassGround(own, own_truth, homes)
-
-
-def _truth(scenario: Scenario, common: Terrain, truth: Floats, name: str) -> Floats:
-    prepared = _KNOWN.get(common, {}).get(_key(scenario, name))
-    if prepared is not None:
-        return prepared.truth
-    own = _terrain(scenario, common, name)
-    if own.flight_m is not None:  # nothing is hidden in the air
-        return own.ground_s_per_m
-    own_prior, prior = own.ground_s_per_m.reshape(-1), common.ground_s_per_m.reshape(-1)
-    read: Floats = read_by(own_prior, prior, truth.reshape(-1), own.least_s_per_m).reshape(truth.shape)
-    return read
 
 
 def _terrain(scenario: Scenario, common: Terrain, name: str) -> Terrain:

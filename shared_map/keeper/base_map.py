@@ -115,9 +115,8 @@ class BaseMapServer:
             layer: b"".join(piece_digest(self._piece(layer, region)) for region in range(grid.regions))
             for layer in LAYERS
         }
-        notes = list(self._terrain.notes)
-        named = {"keeper": self._keeper, "terrain": self._terrain.digest}
-        return BaseMap(**named, **asdict(grid), digests=digests, notes=notes)
+        terrain, notes = self._terrain.digest, list(self._terrain.notes)
+        return BaseMap(keeper=self._keeper, terrain=terrain, **asdict(grid), digests=digests, notes=notes)
 
     def pack(self, layer: str, region: int) -> BaseMapTile:
         """One of `LAYERS` of one region, packed. zlib, because every process has it; byte planes halve what it
