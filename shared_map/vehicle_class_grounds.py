@@ -452,32 +452,25 @@ class ClassMaps:
             if not self.of:
                 return
             self._kinds[cells] = kinds
-            for number, cost_map in self._by_number.items():
-                read = read_marks(cost_map.terrain, self.common.terrain, cells, kinds, paces)
-                cost_map.apply(cells, *self._holding(number, cells, *read))
+            for number in self._by_number:
+                self._show(number, cells, kinds, paces)
         elif (own := self._own.get(class_number)) is not None:
             for cell, kind, pace in zip(cells.tolist(), kinds.tolist(), paces.tolist(), strict=True):
                 if kind == MarkKind.CLEAR:
                     own.pop(cell, None)
                 else:
                     own[cell] = kind, pace
-            cost_map = self._by_number[class_number]
-            ground = self.common.ground_s_per_m.reshape(-1)[cells]
-            read = read_marks(cost_map.terrain, self.common.terrain, cells, self._kinds[cells], ground)
-            cost_map.apply(cells, *self._holding(class_number, cells, *read))
+            self._show(class_number, cells, self._kinds[cells], self.common.ground_s_per_m.reshape(-1)[cells])
 
-    def _holding(
-        self, number: int, cells: NDArray[np.uint32], kinds: NDArray[np.uint8], paces: Floats
-    ) -> tuple[NDArray[np.uint8], Floats]:
-        """Returns the marks that hold for a class, from those for all."""
-        own = self._own[number]
-        if not own:
-            return kinds, paces
-        stated = [own.get(cell, _NOTHING) for cell in cells.tolist()]
-        own_kinds = np.array([kind for kind, _ in stated], np.uint8)
-        own_paces = np.array([pace for _, pace in stated], np.float32)
-        terrain = self._by_number[number].terrain
-        return for_class(terrain, np.asarray(cells, np.int64), kinds, paces, own_kinds, own_paces)
+    def _show(self, number: int, cells: NDArray[np.uint32], kinds: NDArray[np.uint8], paces: Floats) -> None:
+        """Brings the marks that hold for a class onto its map, from those for all."""
+        cost_map, own = self._by_number[number], self._own[number]
+        kinds, paces = read_marks(cost_map.terrain, self.common.terrain, cells, kinds, paces)
+        if own and len(cells):
+            own_kinds, own_paces = zip(*(own.get(cell, _NOTHING) for cell in cells.tolist()), strict=True)
+            stated = np.array(own_kinds, np.uint8), np.array(own_paces, np.float32)
+            kinds, paces = for_class(cost_map.terrain, np.asarray(cells, np.int64), kinds, paces, *stated)
+        cost_map.apply(cells, kinds, paces)
 
 
 _NOTHING = (int(MarkKind.CLEAR), 0.0)
