@@ -32,6 +32,21 @@ def test_odd_shapes_are_taken_as_what_they_enclose(tmp_path: Path) -> None:
     assert facts.file.used == 3
 
 
+def test_an_island_in_a_hole_is_closed_and_a_hole_in_a_hole_is_asked_about(tmp_path: Path) -> None:
+    box, inner, core = (
+        shapely.box(5.2, 5.2, 25.2, 25.2),
+        shapely.box(8.2, 8.2, 22.2, 22.2),
+        shapely.box(12, 12, 15, 15),
+    )
+    nested = shapely.MultiPolygon([box.difference(inner), core])
+    pace, _ = painted([ZoneConfig(kind="forbidden", file=geojson(tmp_path / "a.geojson", [feature(nested)]))])
+    assert pace[13, 13] == pace[6, 6] == np.inf
+    assert pace[10, 10] < np.inf
+    rings = shapely.Polygon(box.exterior, [inner.exterior, core.exterior])
+    with pytest.raises(TerrainError, match=r"feature 0 cannot be used: a hole of it lies in another"):
+        painted([ZoneConfig(kind="forbidden", file=geojson(tmp_path / "b.geojson", [feature(rings)]))])
+
+
 def test_a_shape_that_crosses_itself_thousands_of_times_is_named_not_waited_for(tmp_path: Path) -> None:
     rng = np.random.default_rng(3)
     scribble = shapely.Polygon(rng.uniform(5, 35, (4000, 2)))

@@ -1,4 +1,4 @@
-"""Sightings of targets: the newest wins until it ends by itself. Presence: the newest word of an author and region."""
+"""Sightings of targets: the newest wins until it ends. Presence: the newest word of an author and region."""
 
 import msgspec
 from hypothesis import given
