@@ -93,7 +93,7 @@ REFUSED: dict[str, tuple[Callable[[Path], Path], str]] = {
     "lossy JPEG 2000": (lossy, "is compressed with loss, expected exact numbers"),
     "lossy LERC": (lambda p: written(p, GROUND, compress="lerc", MAX_Z_ERROR=1.0), "is compressed with loss"),
     "unknown unit": (
-        lambda p: written(p, GROUND, units=("0.1 m",)), r"heights in '0\.1 m', an unknown unit; set terrain\.height",
+        lambda p: written(p, GROUND, units=("0.1 m",)), r"heights in '0\.1 m', an unknown unit; set terrain\.h",
     ),
     "colours": (lambda p: written(p, np.stack([GROUND] * 3), "uint8"), "gdal_calc.py unpacks heights from colours"),
     "no place": (

@@ -86,15 +86,6 @@ def test_a_prepared_terrain_of_another_scenario_is_not_taken(tmp_path: Path) -> 
     assert load_prepared(tmp_path / "nowhere") is None
 
 
-@pytest.mark.parametrize("damage", ["terrain.json", "pace.npy", "elevation.npy"])
-def test_a_damaged_prepared_terrain_is_refused_with_a_sentence(tmp_path: Path, damage: str) -> None:
-    prepare(tmp_path, SMALL)
-    path = tmp_path / damage
-    path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
-    with pytest.raises(TerrainError, match="delete"):
-        load_prepared(tmp_path)
-
-
 def test_a_folder_that_cannot_be_written_is_said(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     terrain = terrain_of_pace(np.ones((4, 4), np.float32))
