@@ -175,10 +175,8 @@ class KeeperService(MemberService):
         self._sync.tick(now_ns)
         self._orders.tick(now_ns)
         self._name_throttled(now_ns)
-        counts = self.replica.counts
-        self.counters.counts["marks_merged"] = counts["marks_merged"]
-        for name in ("sets_refused", "sets_without_room"):
-            self.counters.counts[name] = counts[name]
+        for name in ("marks_merged", "sets_refused", "sets_without_room"):
+            self.counters.counts[name] = self.replica.counts[name]
         self.counters.gauge("sets_waiting", float(self._keeper.waiting))
         self._member.tick(now_ns)
 

@@ -42,6 +42,13 @@ def copied(layers: tuple[str, ...] = EVERY) -> BaseMapCopy:
     return BaseMapCopy(SERVER.described, TERRAIN.digest, layers)
 
 
+def complete(layers: tuple[str, ...]) -> BaseMapCopy:
+    copy = copied(layers)
+    for tile in pieces(layers):
+        copy.take(tile)
+    return copy
+
+
 def pieces(layers: tuple[str, ...] = EVERY) -> list[BaseMapTile]:
     return [SERVER.pack(layer, region) for layer in layers for region in range(TERRAIN.grid.regions)]
 
@@ -64,10 +71,7 @@ def test_a_terrain_in_pieces_in_any_order_and_twice_is_the_same_terrain(parts, a
 
 
 def test_without_its_photo_the_terrain_is_as_good_to_drive_on() -> None:
-    copy = copied(NEEDED)
-    for tile in pieces(NEEDED):
-        copy.take(tile)
-    made = copy.terrain(SCENARIO.cost)
+    made = complete(NEEDED).terrain(SCENARIO.cost)
     assert made.digest == TERRAIN.digest
     assert not made.photo.any()
 
@@ -109,11 +113,8 @@ def test_a_description_of_another_terrain_or_of_too_much_is_refused() -> None:
 
 
 def test_other_cost_rules_make_another_terrain_and_are_told_of() -> None:
-    copy = copied(NEEDED)
-    for tile in pieces(NEEDED):
-        copy.take(tile)
     with pytest.raises(TerrainError, match=r"are the \[cost\] sections of the scenarios the same"):
-        copy.terrain(CostConfig(vehicle_radius_m=40.0, max_slope_deg=20.0))
+        complete(NEEDED).terrain(CostConfig(vehicle_radius_m=40.0, max_slope_deg=20.0))
 
 
 def test_where_a_mask_lies_makes_no_other_terrain(tmp_path: Path) -> None:

@@ -15,7 +15,9 @@ from support.effort import few
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
 from shared_map import vehicle_class_grounds as module
+from shared_map.array_files import Floats
 from shared_map.terrain.store import load_beside, prepare, scenario_key
+from shared_map.terrain.terrain import Terrain
 from shared_map.vehicle_class_grounds import (
     air_ground,
     class_grounds,
@@ -26,7 +28,7 @@ from shared_map.vehicle_class_grounds import (
     load_classes,
     prepare_classes,
 )
-from swarm.config.scenario import PlannerConfig
+from swarm.config.scenario import PlannerConfig, Scenario
 from swarm.config.toml_files import parse_scenario
 from swarm.config.vehicle_classes import AirConfig
 from swarm.errors import TerrainError
@@ -45,15 +47,21 @@ cost = {{ max_slope_deg = 40.0, vehicle_radius_m = 9.0 }}
 """
 
 
+def prepared(folder: Path, scenario: Scenario) -> tuple[Terrain, Floats, RoleSetup]:
+    """A run's folder with its terrain, truth and grounds of classes; and a process of that run."""
+    terrain, truth = prepare(folder, scenario)
+    prepare_classes(folder, scenario, terrain, truth)
+    return terrain, truth, RoleSetup(scenario, "run", "agent", "a0", 1, 1, run_dir=folder)
+
+
 @pytest.mark.parametrize("directional", ["false", "true"])
 def test_what_is_prepared_is_what_would_be_made(tmp_path, directional, monkeypatch):
     scenario = parse_scenario(_TEXT.format(speed=1.5, directional=directional))
-    terrain, truth = prepare(tmp_path, scenario)
-    made = class_grounds(scenario, terrain, truth)
-    prepare_classes(tmp_path, scenario, terrain, truth)
+    made = class_grounds(scenario, *prepare(tmp_path, scenario))
+    _, _, setup = prepared(tmp_path, scenario)
     again, truth_again = prepare(tmp_path, scenario)
     monkeypatch.setattr(module, "build_terrain", None)  # nothing is built twice
-    load_classes(RoleSetup(scenario, "run", "agent", "a0", 1, 1, run_dir=tmp_path), again)
+    load_classes(setup, again)
     found = class_grounds(scenario, again, truth_again)
     assert np.array_equal(load_beside(tmp_path, "homes", scenario_key(scenario)), made["ground"].homes)
     assert load_beside(tmp_path, "homes", "another") is None
@@ -73,8 +81,7 @@ def test_what_is_prepared_is_what_would_be_made(tmp_path, directional, monkeypat
 
 def test_a_folder_of_another_class_is_none(tmp_path: Path) -> None:
     slow, quick = (parse_scenario(_TEXT.format(speed=speed, directional="false")) for speed in (0.5, 1.5))
-    terrain, truth = prepare(tmp_path, slow)
-    prepare_classes(tmp_path, slow, terrain, truth)
+    terrain, truth, _ = prepared(tmp_path, slow)
     load_classes(RoleSetup(quick, "run", "agent", "a0", 1, 1, run_dir=tmp_path), terrain)
     walker = class_grounds(quick, terrain, truth)["walker"]
     assert 1 / 1.5 <= float(walker.truth.min()) < 1.0
@@ -82,15 +89,14 @@ def test_a_folder_of_another_class_is_none(tmp_path: Path) -> None:
 
 def test_a_launcher_makes_a_damaged_folder_again_and_another_process_says_it_in_one_sentence(tmp_path):
     scenario = parse_scenario(_TEXT.format(speed=1.5, directional="false"))
-    terrain, truth = prepare(tmp_path, scenario)
-    prepare_classes(tmp_path, scenario, terrain, truth)
+    terrain, truth, setup = prepared(tmp_path, scenario)
     pace, description = (tmp_path / "classes/walker" / name for name in ("pace.npy", "class.json"))
     whole = pace.read_bytes()
     pace.unlink()  # it may be linked to the kept one
     pace.write_bytes(whole[:-2] + bytes([whole[-2] ^ 1]) + whole[-1:])
     description.write_text("{")
     with pytest.raises(TerrainError, match=r"prepared class .* is damaged .*; delete the folder"):
-        load_classes(RoleSetup(scenario, "run", "agent", "a0", 1, 1, run_dir=tmp_path), terrain)
+        load_classes(setup, terrain)
     prepare_classes(tmp_path, scenario, terrain, truth)
     assert pace.read_bytes() == whole
 
@@ -109,11 +115,10 @@ groups = [{ vehicles = 1 }, { name = "drones", class = "drone", vehicles = 1 }]
 classes = [{ name = "drone", air = { speed_m_per_s = 10 } }]
 """
     west, south = (parse_scenario(f"{text}wind = {{ speed_m_per_s = 4, from_deg = {of} }}") for of in (270, 180))
-    terrain, truth = prepare(tmp_path, west)
-    prepare_classes(tmp_path, west, terrain, truth)
+    terrain, _, setup = prepared(tmp_path, west)
     made = class_terrains(west, terrain)["drone"]
     again, _ = prepare(tmp_path, west)
-    load_classes(RoleSetup(west, "run", "agent", "a0", 1, 1, run_dir=tmp_path), again)
+    load_classes(setup, again)
     found = class_terrains(west, again)["drone"]
     assert found is not made
     assert found.climb.wind == made.climb.wind
