@@ -472,23 +472,7 @@ def _drawn(laid: Bools, stride: int, pace: Floats) -> Bools:
     return road & np.isfinite(pace)
 
 
-TINT = np.array(
-    [
-        [122, 118, 100],  # UNKNOWN
-        [42, 74, 98],  # WATER
-        [58, 84, 46],  # FOREST
-        [138, 130, 120],  # ROCK
-        [126, 142, 78],  # GRASS
-        [156, 134, 98],  # SOIL
-        [186, 178, 164],  # ROAD
-        [164, 122, 108],  # BUILT
-        [236, 240, 244],  # SNOW
-        [104, 116, 66],  # SHRUB
-        [88, 108, 94],  # WETLAND
-    ],
-    np.uint8,
-)
-"""Natural colours of the classes, as in a photograph."""
+TINT = np.array([kind.tint for kind in TerrainClass], np.uint8)
 
 
 def synthetic_elevation(rows: int, cols: int, relief_m: float, seed: int) -> Floats:

@@ -15,7 +15,7 @@ from shared_map.importers.cover import classify
 from shared_map.importers.cover.classify import Labels, box_sum, class_readings, held_out, learnt, read_labels
 from shared_map.importers.cover.photos import Photo
 from shared_map.importers.terrain_sources import Source, load_source, with_photo
-from shared_map.terrain.pace_layers import CLASS_FACTOR, READABLE, TerrainClass, doubt_factors, terrain_pace
+from shared_map.terrain.pace_layers import READABLE, TerrainClass, doubt_factors, terrain_pace
 from shared_map.terrain.synthetic import fractal_noise, landscape, paint_photo
 from swarm.config.ground import CostConfig, TerrainConfig
 from swarm.errors import TerrainError
@@ -301,8 +301,8 @@ def test_a_doubted_cell_costs_what_the_dearest_of_its_readings_does() -> None:
     grass, forest, rock = (BIT[kind] for kind in (TerrainClass.GRASS, TerrainClass.FOREST, TerrainClass.ROCK))
     factors = doubt_factors(CostConfig())
     assert factors[0] == factors[BIT[TerrainClass.UNKNOWN]] == 1
-    assert factors[grass | forest] == np.float32(CLASS_FACTOR[TerrainClass.FOREST])
-    assert factors[grass | forest | rock] == np.float32(CLASS_FACTOR[TerrainClass.ROCK])
+    assert factors[grass | forest] == np.float32(TerrainClass.FOREST.factor)
+    assert factors[grass | forest | rock] == np.float32(TerrainClass.ROCK.factor)
     lethal = doubt_factors(CostConfig(class_factor={"rock": "lethal", "forest": "lethal"}))
     assert lethal[grass | rock] == 1
     assert np.isinf(lethal[forest | rock])

@@ -10,7 +10,6 @@ from support.height_models import written
 
 from shared_map.importers.terrain_sources import load_source
 from shared_map.terrain.pace_layers import (
-    CLASS_FACTOR,
     TerrainClass,
     gradient_of_padded,
     polygon_mask,
@@ -125,7 +124,7 @@ def test_a_scenario_sets_the_factor_of_a_class() -> None:
     np.testing.assert_allclose(pace, [[0.4, math.inf]])
     ignored = terrain_pace(level, classes, CostConfig(classes=False))
     np.testing.assert_allclose(ignored, [[0.1, 0.1]])
-    assert CLASS_FACTOR[TerrainClass.WATER] == math.inf
+    assert TerrainClass.WATER.factor == math.inf
 
 
 def test_a_polygon_covers_the_cells_whose_middle_lies_in_it() -> None:
