@@ -48,8 +48,9 @@ def written(path: Path, bands: Any, dtype: str | None = "float32", **profile: An
         file.write(bands)
         for name, values in later.items():
             setattr(file, name, values)
-        file.update_tags(**tags or {})
-        file.update_tags(1, **of_band or {})
+        for level, given in ((0, tags), (1, of_band)):
+            if given:  # GDAL writes its directory again even for none
+                file.update_tags(level, **given)
         if mask is not None:
             file.write_mask(mask)
         if colours is not None:
