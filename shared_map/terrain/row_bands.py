@@ -71,7 +71,7 @@ Part = tuple[slice, slice]
 
 
 def neighbours(shape: tuple[int, ...], down: int, right: int) -> tuple[Part, Part]:
-    """(the cells with a neighbour so many rows below and columns to the right, these neighbours)."""
+    """(cells with a neighbour `down` rows below and `right` columns to the right, these neighbours), as slices."""
     rows, cols = shape
     here = np.s_[max(-down, 0) : rows - max(down, 0), max(-right, 0) : cols - max(right, 0)]
     there = np.s_[max(down, 0) : rows + min(down, 0), max(right, 0) : cols + min(right, 0)]
