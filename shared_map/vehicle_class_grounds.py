@@ -460,7 +460,8 @@ class ClassMaps:
                     own.pop(cell, None)
                 else:
                     own[cell] = kind, pace
-            self._show(class_number, cells, self._kinds[cells], self.common.ground_s_per_m.reshape(-1)[cells])
+            paces = self.common.ground_s_per_m.reshape(-1)[cells]
+            self._show(class_number, cells, self._kinds[cells], paces)
 
     def _show(self, number: int, cells: NDArray[np.uint32], kinds: NDArray[np.uint8], paces: Floats) -> None:
         """Brings the marks that hold for a class onto its map, from those for all."""

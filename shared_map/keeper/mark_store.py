@@ -176,7 +176,8 @@ class KeeperStore(SealedDatabase):
 
     def save_sightings(self, seen: Iterable[Sighted]) -> None:
         """Keeps where each target was seen last."""
-        self._commit(_SIGHTINGS, [(each.target, each.stamp_ns, encode(each)) for each in seen], ("stamp_ns",))
+        rows = [(each.target, each.stamp_ns, encode(each)) for each in seen]
+        self._commit(_SIGHTINGS, rows, ("stamp_ns",))
 
     def sightings(self) -> list[Sighted]:
         """The last sighting of each target, in order of target."""

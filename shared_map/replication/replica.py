@@ -265,8 +265,8 @@ class MapReplica:
         before_ns, self._now_ns = self._now_ns, max(now_ns, self._now_ns)
         if now_ns < self._soonest_ns:
             return
-        expired = {tile: self.held.of_tile(tile) for tile, due_ns in self._expiry_ns.items() if due_ns <= now_ns}
-        self._expiry_ns = {tile: due_ns for tile, due_ns in self._expiry_ns.items() if tile not in expired}
+        expired = {tile: self.held.of_tile(tile) for tile, at_ns in self._expiry_ns.items() if at_ns <= now_ns}
+        self._expiry_ns = {tile: at_ns for tile, at_ns in self._expiry_ns.items() if tile not in expired}
         self._soonest_ns = min(self._expiry_ns.values(), default=FOREVER)
         self.zones_version += any(marks.is_zone(each.author) for sets in expired.values() for each in sets)
         self._settle(expired, before_ns, False)
