@@ -18,7 +18,6 @@ from shared_map.learned_factors import factors_in, keys_of
 from shared_map.pace_measurements import KEYS
 from shared_map.terrain.pace_layers import LETHAL, inflate, inflation_halves
 from shared_map.terrain.terrain import Terrain
-from swarm.errors import OutsideGridError
 from swarm.grid import TILE_CELLS, Window
 from swarm.wire.messages.map_data import PACE_MOST, MarkKind, MarkSet
 
@@ -88,7 +87,7 @@ class CostMap:
         """Makes these the current statements about these cells; of a repeated cell the last counts. PACE sets the
         pace, even where the prior is lethal; LETHAL makes the cell lethal; CLEAR restores the prior.
 
-        cells  uint32 (n,)   flat indices in the grid; raises OutsideGridError if one is not in it
+        cells  uint32 (n,)   flat indices in the grid; raises IndexError if one is not in it
         kinds  uint8 (n,)    MarkKind
         paces  float32 (n,)  s/m; read where the kind is PACE
         class_number  0 for all vehicles; marks for one class alone change nothing here (see `ClassMaps`)
@@ -98,8 +97,6 @@ class CostMap:
         where = np.asarray(cells, np.int64)
         if not len(where):
             return
-        if int(where.min()) < 0 or int(where.max()) >= self.grid.cells:
-            raise OutsideGridError(f"a mark is on cell {int(where.max())} of {self.grid.rows} x {self.grid.cols}")
         if self._stated is not None:
             self._stated[where] = np.asarray(kinds) != MarkKind.CLEAR
         where, values = self._last_of_each(where, np.asarray(kinds), np.asarray(paces, np.float32))

@@ -69,9 +69,10 @@ def keys_of(classes: Bytes, elevation_m: Floats, resolution_m: float) -> Bytes:
 def name_of(key: int) -> str:
     """A kind of ground for people, such as `forest 10-15`."""
     number, low = key // SLOPE_BINS, key % SLOPE_BINS * SLOPE_BIN_DEG
-    if number not in tuple(TerrainClass):
+    kinds = [*TerrainClass]
+    if number >= len(kinds):
         return f"unknown {key}"
-    kind = TerrainClass(number).name.lower()
+    kind = kinds[number].name.lower()
     return f"{kind} {low}-{low + SLOPE_BIN_DEG}" if key % SLOPE_BINS < SLOPE_BINS - 1 else f"{kind} {low}+"
 
 

@@ -219,8 +219,9 @@ def class_terrains(scenario: Scenario, common: Terrain, names: Iterable[str] | N
 
 def class_truths(scenario: Scenario, common: Terrain, truth: Floats) -> dict[str, Floats]:
     """Class -> the truth for it, of "ground" and of every class that vehicles of the scenario belong to."""
-    others = {name: _truth(scenario, common, truth, name) for name in driven_classes(scenario)}
-    return {GROUND: truth, **others}
+    return {GROUND: truth} | {
+        name: _ground(scenario, common, truth, name).truth for name in driven_classes(scenario)
+    }
 
 
 def class_grounds(
@@ -232,10 +233,7 @@ def class_grounds(
     """
     known = store.homes_of(common.pace_s_per_m, truth) if homes is None else homes
     grounds = {GROUND: ClassGround(common, truth, known)}
-    for name in driven_classes(scenario):
-        prepared = _KNOWN.get(common, {}).get(_key(scenario, name))
-        grounds[name] = prepared or _ground(scenario, common, truth, name)
-    return grounds
+    return grounds | {name: _ground(scenario, common, truth, name) for name in driven_classes(scenario)}
 
 
 def least_pace(own: ClassConfig | None) -> float:
@@ -246,23 +244,18 @@ def least_pace(own: ClassConfig | None) -> float:
 
 
 def _ground(scenario: Scenario, common: Terrain, truth: Floats, name: str) -> ClassGround:
-    own, own_truth = _terrain(scenario, common, name), _truth(scenario, common, truth, name)
+    prepared = _KNOWN.get(common, {}).get(_key(scenario, name))
+    if prepared is not None:
+        return prepared
+    own = _terrain(scenario, common, name)
+    own_truth = own.ground_s_per_m
+    if own.flight_m is None:  # nothing is hidden in the air
+        priors = own_truth.reshape(-1), common.ground_s_per_m.reshape(-1)
+        own_truth = read_by(*priors, truth.reshape(-1), own.least_s_per_m).reshape(truth.shape)
     homes = store.homes_of(own.pace_s_per_m, own_truth)
     if not homes.any():
         raise TerrainError(f"class {name}: no cell that it can drive by the map is so in truth")
     return ClassGround(own, own_truth, homes)
-
-
-def _truth(scenario: Scenario, common: Terrain, truth: Floats, name: str) -> Floats:
-    prepared = _KNOWN.get(common, {}).get(_key(scenario, name))
-    if prepared is not None:
-        return prepared.truth
-    own = _terrain(scenario, common, name)
-    if own.flight_m is not None:  # nothing is hidden in the air
-        return own.ground_s_per_m
-    own_prior, prior = own.ground_s_per_m.reshape(-1), common.ground_s_per_m.reshape(-1)
-    read: Floats = read_by(own_prior, prior, truth.reshape(-1), own.least_s_per_m).reshape(truth.shape)
-    return read
 
 
 def _terrain(scenario: Scenario, common: Terrain, name: str) -> Terrain:
@@ -459,32 +452,26 @@ class ClassMaps:
             if not self.of:
                 return
             self._kinds[cells] = kinds
-            for number, cost_map in self._by_number.items():
-                read = read_marks(cost_map.terrain, self.common.terrain, cells, kinds, paces)
-                cost_map.apply(cells, *self._holding(number, cells, *read))
+            for number in self._by_number:
+                self._show(number, cells, kinds, paces)
         elif (own := self._own.get(class_number)) is not None:
             for cell, kind, pace in zip(cells.tolist(), kinds.tolist(), paces.tolist(), strict=True):
                 if kind == MarkKind.CLEAR:
                     own.pop(cell, None)
                 else:
                     own[cell] = kind, pace
-            cost_map = self._by_number[class_number]
-            ground = self.common.ground_s_per_m.reshape(-1)[cells]
-            read = read_marks(cost_map.terrain, self.common.terrain, cells, self._kinds[cells], ground)
-            cost_map.apply(cells, *self._holding(class_number, cells, *read))
+            paces = self.common.ground_s_per_m.reshape(-1)[cells]
+            self._show(class_number, cells, self._kinds[cells], paces)
 
-    def _holding(
-        self, number: int, cells: NDArray[np.uint32], kinds: NDArray[np.uint8], paces: Floats
-    ) -> tuple[NDArray[np.uint8], Floats]:
-        """Returns the marks that hold for a class, from those for all."""
-        own = self._own[number]
-        if not own:
-            return kinds, paces
-        stated = [own.get(cell, _NOTHING) for cell in cells.tolist()]
-        own_kinds = np.array([kind for kind, _ in stated], np.uint8)
-        own_paces = np.array([pace for _, pace in stated], np.float32)
-        terrain = self._by_number[number].terrain
-        return for_class(terrain, np.asarray(cells, np.int64), kinds, paces, own_kinds, own_paces)
+    def _show(self, number: int, cells: NDArray[np.uint32], kinds: NDArray[np.uint8], paces: Floats) -> None:
+        """Brings the marks that hold for a class onto its map, from those for all."""
+        cost_map, own = self._by_number[number], self._own[number]
+        kinds, paces = read_marks(cost_map.terrain, self.common.terrain, cells, kinds, paces)
+        if own and len(cells):
+            own_kinds, own_paces = zip(*(own.get(cell, _NOTHING) for cell in cells.tolist()), strict=True)
+            stated = np.array(own_kinds, np.uint8), np.array(own_paces, np.float32)
+            kinds, paces = for_class(cost_map.terrain, np.asarray(cells, np.int64), kinds, paces, *stated)
+        cost_map.apply(cells, kinds, paces)
 
 
 _NOTHING = (int(MarkKind.CLEAR), 0.0)

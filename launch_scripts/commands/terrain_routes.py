@@ -245,7 +245,7 @@ def _check_open(scenario: Scenario, terrain: Terrain, cell: int, option: str, ot
     if not lethal[cell]:
         return
     grid, frame = terrain.grid, MapFrame(terrain.grid)
-    kind = TerrainClass(terrain.classes.reshape(-1)[cell]).name.lower()
+    kind = [*TerrainClass][terrain.classes.reshape(-1)[cell]].name.lower()
     seconds = terrain.pace_s_per_m if lethal[other] else finder_for(scenario, terrain, other).cost_to_go_s()
     told = f"{option} is on lethal ground, {written(frame, cell)}, class {kind}: no way leads there"
     told += f"; ground above {scenario.cost.max_slope_deg:g} degrees is lethal (--preset, cost.max_slope_deg)"

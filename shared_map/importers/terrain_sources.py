@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import importlib.util
+import os
 from dataclasses import KW_ONLY, dataclass, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -73,8 +74,12 @@ def load_source(config: TerrainConfig, seed: int, progress: Progress = no_progre
     ------
     TerrainError
         With one sentence: a file is missing, damaged, of an unknown kind or without heights, a key that it needs is
-        not set, or photo and terrain do not overlap.
+        not set, or photo and terrain do not overlap. Also if `source` is no path, as of an array from Python.
     """
+    given: object = config.source  # Python's callers may give anything
+    if not isinstance(given, str | os.PathLike):
+        how = "numpy.savez('heights.npz', elevation=ARRAY, resolution_m=10.0) makes a file of an array"
+        raise TerrainError(f"terrain.source is of type {type(given).__name__}, expected a path: {how}")
     if config.source == "synthetic":
         source = _synthetic(config, seed)
     elif config.source == "jacksboro":

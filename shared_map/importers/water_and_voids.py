@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from shared_map.array_files import Bools, Floats
 from shared_map.importers.survey_cells import surveyed
+from shared_map.terrain.row_bands import neighbours
 from swarm.config.ground import TerrainConfig
 
 _LEAST_ALIKE, _LEAST_ALIKE_MEANS = 2, 3
@@ -110,10 +111,7 @@ def _grow(elevation_m: Floats, labels: Labels, height_m: Floats) -> None:
 
 def labelled(elevation_m: Floats, same_m: np.float32, least_cells: int, least_alike: int) -> tuple[Labels, Counts]:
     """(labels, cells of each patch), numbered as they come from the north-west."""
-    cols = elevation_m.shape[1]
-    first = [np.s_[: len(elevation_m) - down, max(-right, 0) : cols - max(right, 0)] for down, right in _STEPS]
-    second = [np.s_[down:, max(right, 0) : cols - max(-right, 0)] for down, right in _STEPS]
-    sides = list(zip(first, second, strict=True))
+    sides = [neighbours(elevation_m.shape, *step) for step in _STEPS]
     same = [np.abs(elevation_m[other] - elevation_m[one]) <= same_m for one, other in sides]
     alike = np.zeros(elevation_m.shape, np.uint8)
     for (one, other), joined in zip(sides, same, strict=True):
@@ -285,11 +283,9 @@ def _judged(
     step_m       what heights are rounded to; 0 if they are not
     """
     labels, cells = found.labels, found.cells
-    rows, cols = labels.shape
     sides = np.zeros((7, len(cells)), np.int64)
     for down, right in ((-1, 0), (1, 0), (0, -1), (0, 1)):
-        here = np.s_[max(-down, 0) : rows - max(down, 0), max(-right, 0) : cols - max(right, 0)]
-        there = np.s_[max(down, 0) : rows + min(down, 0), max(right, 0) : cols + min(right, 0)]
+        here, there = neighbours(labels.shape, down, right)
         at = (labels[here] > 0) & (labels[there] != labels[here])
         patch, beyond = labels[here][at], labels[there][at]
         above_m = elevation_m[there][at] - elevation_m[here][at]

@@ -71,48 +71,6 @@ def piece_digest(piece: bytes) -> bytes:
     return hashlib.blake2b(piece, digest_size=BASE_DIGEST_BYTES).digest()
 
 
-def _piece(terrain: Terrain, layer: str, region: int) -> bytes:
-    array: NDArray[Any] = getattr(terrain, LAYERS[layer].field)
-    window = region_window(terrain.grid, region)
-    return array[window.row0 : window.row1, window.col0 : window.col1].tobytes()
-
-
-def describe(terrain: Terrain, keeper: str) -> BaseMap:
-    """Returns a keeper's description of its terrain: grid, notes, and the digest of every layer of every region.
-
-    `keeper` is the keeper's id, which a refusal names.
-    """
-    grid = terrain.grid
-    digests = {
-        layer: b"".join(piece_digest(_piece(terrain, layer, region)) for region in range(grid.regions))
-        for layer in LAYERS
-    }
-    return BaseMap(
-        keeper=keeper, terrain=terrain.digest, **asdict(grid), digests=digests, notes=list(terrain.notes)
-    )
-
-
-def pack(terrain: Terrain, layer: str, region: int) -> BaseMapTile:
-    """One layer of one region, packed. zlib, because every process has it; byte planes halve what it leaves of
-    floats.
-
-    Parameters
-    ----------
-    layer : str
-        One of `LAYERS`.
-    region : int
-        0 to grid.regions - 1.
-
-    Raises
-    ------
-    KeyError
-        If there is no such layer.
-    """
-    values = np.frombuffer(_piece(terrain, layer, region), np.uint8)
-    planes = values.reshape(-1, np.dtype(LAYERS[layer].dtype).itemsize).T.tobytes()
-    return BaseMapTile(layer=layer, region=region, data=zlib.compress(planes, _LEVEL))
-
-
 class BaseMapServer:
     """Answers for a terrain, which never changes: so on a thread of its own, beside the keeper's loop, which a
     large map must not hold up. Pieces are packed once and kept."""
@@ -120,7 +78,7 @@ class BaseMapServer:
     def __init__(self, terrain: Terrain, keeper: str) -> None:
         self._terrain = terrain
         self._keeper = keeper
-        self._packed = lru_cache(_PIECES_KEPT)(self._pack)
+        self._packed = lru_cache(_PIECES_KEPT)(self.pack)
         self._inbox = Inbox()
         self._starts = threading.Lock()
         """Taken for good by the first question, which starts the thread."""
@@ -149,7 +107,7 @@ class BaseMapServer:
         request = event.request
         regions = self._terrain.grid.regions
         if not isinstance(request, BaseMapRequest):
-            event.answer(self._described)
+            event.answer(self.described)
         elif unknown := [layer for layer in request.layers if layer not in LAYERS]:
             event.refuse(f"there is no layer {unknown[0][:40]!r}; there are {', '.join(LAYERS)}")
         elif len(request.layers) * len(request.regions) > _PIECES_PER_REQUEST:
@@ -163,11 +121,27 @@ class BaseMapServer:
         event.end()
 
     @cached_property
-    def _described(self) -> BaseMap:
-        return describe(self._terrain, self._keeper)
+    def described(self) -> BaseMap:
+        """Grid, notes, and the digest of every layer of every region. A refusal names the keeper."""
+        grid = self._terrain.grid
+        digests = {
+            layer: b"".join(piece_digest(self._piece(layer, region)) for region in range(grid.regions))
+            for layer in LAYERS
+        }
+        terrain, notes = self._terrain.digest, list(self._terrain.notes)
+        return BaseMap(keeper=self._keeper, terrain=terrain, **asdict(grid), digests=digests, notes=notes)
 
-    def _pack(self, layer: str, region: int) -> BaseMapTile:
-        return pack(self._terrain, layer, region)
+    def pack(self, layer: str, region: int) -> BaseMapTile:
+        """One of `LAYERS` of one region, packed. zlib, because every process has it; byte planes halve what it
+        leaves of floats."""
+        values = np.frombuffer(self._piece(layer, region), np.uint8)
+        planes = values.reshape(-1, np.dtype(LAYERS[layer].dtype).itemsize).T.tobytes()
+        return BaseMapTile(layer=layer, region=region, data=zlib.compress(planes, _LEVEL))
+
+    def _piece(self, layer: str, region: int) -> bytes:
+        array: NDArray[Any] = getattr(self._terrain, LAYERS[layer].field)
+        window = region_window(self._terrain.grid, region)
+        return array[window.row0 : window.row1, window.col0 : window.col1].tobytes()
 
 
 # --- the side of a process without the files --------------------------------------------------------------------

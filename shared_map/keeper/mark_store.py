@@ -6,6 +6,7 @@ import json
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict
 from pathlib import Path
+from typing import TypeVar
 
 import msgspec
 
@@ -21,6 +22,7 @@ from swarm.wire.messages.map_data import SEQ_STEP, MarkSet
 from swarm.wire.messages.orders import Order, VehicleGoals
 from swarm.wire.messages.planning import Sighted
 
+_Kept = TypeVar("_Kept", Order, VehicleGoals)
 BATCH_BYTES = 1 << 19
 """Marks of one commit, about."""
 _FIELDS = ("tile", "author", "group", "epoch", "seq", "cells", "kinds", "paces", "stamps_ns", "untils_ns")
@@ -174,9 +176,8 @@ class KeeperStore(SealedDatabase):
 
     def save_sightings(self, seen: Iterable[Sighted]) -> None:
         """Commits the last sighting of each target."""
-        with self._writing():
-            rows = [(each.target, each.stamp_ns, encode(each)) for each in seen]
-            self._put(_SIGHTINGS, *rows, newer=("stamp_ns",))
+        rows = [(each.target, each.stamp_ns, encode(each)) for each in seen]
+        self._commit(_SIGHTINGS, rows, ("stamp_ns",))
 
     def sightings(self) -> list[Sighted]:
         """The last sighting of each target, in order of target."""
@@ -186,28 +187,29 @@ class KeeperStore(SealedDatabase):
     def save_orders(self, orders: Iterable[Order]) -> None:
         """Commits the newest orders."""
         rows = [(each.subject, each.name, each.stamp_ns, msgspec.json.encode(each)) for each in orders]
-        if rows:
-            with self._writing():
-                self._put(_ORDERS, *rows, newer=("stamp_ns",))
+        self._commit(_ORDERS, rows, ("stamp_ns",))
 
     def orders(self) -> list[Order]:
         """The newest order about each subject."""
-        with self._reading("orders: "):
-            rows = self._rows(_ORDERS, "ORDER BY subject, name")
-            return [msgspec.json.decode(body, type=Order) for *_, body in rows]
+        return self._read_json("orders: ", Order, _ORDERS, "ORDER BY subject, name")
 
     def save_goals(self, goals: Iterable[VehicleGoals]) -> None:
         """Commits the newest goals of vehicles. They are rows of `meta`, as older builds know no other table."""
-        rows = [(f"{_GOALS}{each.name}", msgspec.json.encode(each).decode()) for each in goals]
-        if rows:
-            with self._writing():
-                self._put(META, *rows)
+        self._commit(META, [(f"{_GOALS}{each.name}", msgspec.json.encode(each).decode()) for each in goals])
 
     def goals(self) -> list[VehicleGoals]:
         """The newest goals of each vehicle."""
-        with self._reading("goals: "):
-            rows = self._rows(META, "WHERE key GLOB ? ORDER BY key", f"{_GOALS}*")
-            return [msgspec.json.decode(body, type=VehicleGoals) for _, body in rows]
+        return self._read_json("goals: ", VehicleGoals, META, "WHERE key GLOB ? ORDER BY key", f"{_GOALS}*")
+
+    def _commit(self, table: Table, rows: Sequence[Sequence[object]], newer: Sequence[str] = ()) -> None:
+        if rows:
+            with self._writing():
+                self._put(table, *rows, newer=newer)
+
+    def _read_json(self, what: str, kind: type[_Kept], table: Table, where: str, *values: object) -> list[_Kept]:
+        """The last column of rows of a table."""
+        with self._reading(what):
+            return [msgspec.json.decode(row[-1], type=kind) for row in self._rows(table, where, *values)]
 
     def __enter__(self) -> KeeperStore:
         return self

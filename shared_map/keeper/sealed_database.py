@@ -207,7 +207,7 @@ class SealedDatabase:
                 part.replace(self.path)
                 sync_folder(self.path.parent)
         witness = witness_of(self.path, _KIND)
-        db = _connect_to_read(self.path) if self._read_only else _connect(self.path)
+        db = _connect(self.path, read_only=self._read_only)
         try:
             return self._checked(db, witness)
         except (sqlite3.DatabaseError, ValueError) as error:  # a ValueError where its message is not UTF-8
@@ -271,11 +271,16 @@ class SealedDatabase:
         return db
 
 
-def _connect(path: Path | str) -> sqlite3.Connection:
+def _connect(path: Path | str, *, read_only: bool = False) -> sqlite3.Connection:
+    if read_only and not Path(path).is_file():
+        raise StoreError(f"there is no store {path}: no such file; a run leaves one as runs/RUN/map.sqlite")
+    name = f"file:{quote(str(path))}?mode=ro" if read_only else path
     try:
-        db = sqlite3.connect(path, check_same_thread=False, timeout=2.0)
+        db = sqlite3.connect(name, check_same_thread=False, timeout=2.0, uri=read_only)
     except sqlite3.Error as error:
         raise StoreError(f"cannot open the store {path}: {error}") from error
+    if read_only:
+        return db
     try:
         db.execute("PRAGMA journal_mode = WAL")
         db.execute("PRAGMA synchronous = FULL")
@@ -288,15 +293,6 @@ def _connect(path: Path | str) -> sqlite3.Connection:
         db.close()
         raise _refused(path, error) from error
     return db
-
-
-def _connect_to_read(path: Path) -> sqlite3.Connection:
-    if not path.is_file():
-        raise StoreError(f"there is no store {path}: no such file; a run leaves one as runs/RUN/map.sqlite")
-    try:
-        return sqlite3.connect(f"file:{quote(str(path))}?mode=ro", uri=True, timeout=2.0)
-    except sqlite3.Error as error:
-        raise StoreError(f"cannot open the store {path}: {error}") from error
 
 
 def _refused(path: Path | str, error: Exception) -> SwarmError:

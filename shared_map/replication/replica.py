@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import heapq
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Protocol
@@ -100,7 +99,7 @@ class MapReplica:
         self._newest_ns: int | None = None  # see `take_newest_stamp_ns`
         self._now_ns = 0  # the winners in the cost map are those at this time
         self._expiry_ns: dict[int, int] = {}  # tile -> when to look for expired statements, of those with any
-        self._expiries: list[tuple[int, int]] = []  # heap of the same as (when, tile), and of some outdated ones
+        self._soonest_ns = FOREVER  # the first of these times, or one before it
 
     # --- merging --------------------------------------------------------------------------------------------
 
@@ -257,25 +256,18 @@ class MapReplica:
     def _await_expiry(self, tile: int, sets: Iterable[MarkSet]) -> None:
         """Checks a tile again when the next statement of these sets expires."""
         ends = [end_ns for each in sets if (end_ns := marks.next_expiry_ns(each, self._now_ns)) is not None]
-        if not ends or min(ends) >= self._expiry_ns.get(tile, FOREVER):
-            return
-        self._expiry_ns[tile] = min(ends)
-        heapq.heappush(self._expiries, (min(ends), tile))
-        if len(self._expiries) > 2 * len(self._expiry_ns) + 64:  # so that no stream of sets makes it grow
-            self._expiries = [(when_ns, of) for of, when_ns in self._expiry_ns.items()]
-            heapq.heapify(self._expiries)
+        if ends:
+            self._expiry_ns[tile] = min(*ends, self._expiry_ns.get(tile, FOREVER))
+            self._soonest_ns = min(self._soonest_ns, self._expiry_ns[tile])
 
     def _expire(self, now_ns: int) -> None:
         """Gives cells whose winning mark expired the next one. Our own marks do not expire."""
         before_ns, self._now_ns = self._now_ns, max(now_ns, self._now_ns)
-        expired: dict[int, list[MarkSet]] = {}
-        while self._expiries and self._expiries[0][0] <= now_ns:
-            when_ns, tile = heapq.heappop(self._expiries)
-            if self._expiry_ns.get(tile) == when_ns:
-                del self._expiry_ns[tile]
-                expired[tile] = self.held.of_tile(tile)
-        if not expired:
+        if now_ns < self._soonest_ns:
             return
+        expired = {tile: self.held.of_tile(tile) for tile, at_ns in self._expiry_ns.items() if at_ns <= now_ns}
+        self._expiry_ns = {tile: at_ns for tile, at_ns in self._expiry_ns.items() if tile not in expired}
+        self._soonest_ns = min(self._expiry_ns.values(), default=FOREVER)
         self.zones_version += any(marks.is_zone(each.author) for sets in expired.values() for each in sets)
         self._settle(expired, before_ns, False)
         for tile, sets in expired.items():

@@ -24,7 +24,7 @@ from __future__ import annotations
 
 import enum
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -39,36 +39,33 @@ LETHAL = np.float32(np.inf)
 
 
 class TerrainClass(enum.IntEnum):
-    """Land cover of a cell."""
+    """Land cover of a cell: its number, factor and tint.
 
-    UNKNOWN = 0
-    WATER = 1
-    FOREST = 2
-    ROCK = 3
-    GRASS = 4
-    SOIL = 5
-    ROAD = 6
-    BUILT = 7
-    SNOW = 8
-    SHRUB = 9
-    WETLAND = 10
+    factor  pace relative to open ground; a scenario may set others in `cost.class_factor`. Shrub is the heavy brush
+            of Soule and Goldman (1972), for people on foot; wetland is a judgement: vehicles get stuck there
+    tint    natural colour, as in a photograph: red, green, blue
+    """
 
+    factor: float
+    tint: tuple[int, int, int]
 
-CLASS_FACTOR: Mapping[TerrainClass, float] = {
-    TerrainClass.UNKNOWN: 1.0,
-    TerrainClass.WATER: math.inf,
-    TerrainClass.FOREST: 1.8,
-    TerrainClass.ROCK: 2.5,
-    TerrainClass.GRASS: 1.0,
-    TerrainClass.SOIL: 1.2,
-    TerrainClass.ROAD: 1.0,
-    TerrainClass.BUILT: 3.0,
-    TerrainClass.SNOW: 2.5,
-    TerrainClass.SHRUB: 1.5,
-    TerrainClass.WETLAND: 5.0,
-}
-"""Pace of a class relative to open ground; a scenario may set others in `cost.class_factor`. Shrub is the heavy
-brush of Soule and Goldman (1972), for people on foot; wetland is a judgement: vehicles get stuck there."""
+    def __new__(cls, number: int, factor: float, tint: tuple[int, int, int]) -> TerrainClass:
+        kind = int.__new__(cls, number)
+        kind._value_, kind.factor, kind.tint = number, factor, tint
+        return kind
+
+    UNKNOWN = 0, 1.0, (122, 118, 100)
+    WATER = 1, math.inf, (42, 74, 98)
+    FOREST = 2, 1.8, (58, 84, 46)
+    ROCK = 3, 2.5, (138, 130, 120)
+    GRASS = 4, 1.0, (126, 142, 78)
+    SOIL = 5, 1.2, (156, 134, 98)
+    ROAD = 6, 1.0, (186, 178, 164)
+    BUILT = 7, 3.0, (164, 122, 108)
+    SNOW = 8, 2.5, (236, 240, 244)
+    SHRUB = 9, 1.5, (104, 116, 66)
+    WETLAND = 10, 5.0, (88, 108, 94)
+
 
 READABLE = (
     TerrainClass.GRASS,
@@ -148,8 +145,8 @@ def slope_deg(elevation_m: Floats, resolution_m: float) -> Floats:
 def class_factors(cost: CostConfig) -> Floats:
     """Factor of each class, indexed by its number: the built-in ones, replaced by the scenario's."""
     factors = np.ones(256, np.float32)
-    for kind, factor in CLASS_FACTOR.items():
-        factors[kind] = factor
+    for kind in TerrainClass:
+        factors[kind] = kind.factor
     for name, value in cost.class_factor.items():
         factors[TerrainClass[name.upper()]] = LETHAL if value == "lethal" else value
     return factors

@@ -67,6 +67,17 @@ def looked_up(flags: Bools, labels: NDArray[np.signedinteger[Any]]) -> Bools:
     return found
 
 
+Part = tuple[slice, slice]
+
+
+def neighbours(shape: tuple[int, ...], down: int, right: int) -> tuple[Part, Part]:
+    """(cells with a neighbour `down` rows below and `right` columns to the right, these neighbours), as slices."""
+    rows, cols = shape
+    here = np.s_[max(-down, 0) : rows - max(down, 0), max(-right, 0) : cols - max(right, 0)]
+    there = np.s_[max(down, 0) : rows + min(down, 0), max(right, 0) : cols + min(right, 0)]
+    return here, there
+
+
 def padded_rows(elevation_m: Floats, row0: int, row1: int) -> Floats:
     """Rows row0 - 1 .. row1 with one more column on each side, float32 (row1 - row0 + 2, cols + 2). Beyond the
     terrain the slope at its border goes on."""

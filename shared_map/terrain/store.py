@@ -91,18 +91,6 @@ class Description(msgspec.Struct, frozen=True, kw_only=True):
         return msgspec.structs.replace(self, sum=zlib.crc32(msgspec.json.encode(rest)))
 
 
-class _Stamp(msgspec.Struct, frozen=True):
-    """The part of every description, older ones too, that says whether the rest is of use.
-
-    sum  None in those of builds which wrote none. `FORMAT` does not tell, as it counts in the digest of a terrain,
-         which neighbouring builds in one run share
-    """
-
-    format: int = 0
-    key: str = ""
-    sum: int | None = None
-
-
 def save_prepared(folder: Path, terrain: Terrain, truth: Floats, key: str = "") -> None:
     """Writes a terrain and its truth where `load_prepared` finds them. The description is written last."""
     arrays: dict[str, NDArray[Any]] = {
@@ -231,11 +219,12 @@ def read_meta(meta_file: Path, key: str) -> Description | None:
     if not meta_file.exists():
         return None
     try:
-        text = read_text(meta_file, FileKind.PREPARED)
-        stamp = msgspec.json.decode(text, type=_Stamp)
-        if stamp.format != FORMAT or stamp.sum is None or (key and stamp.key != key):
+        stated = msgspec.json.decode(read_text(meta_file, FileKind.PREPARED), type=dict[str, Any])
+        # `FORMAT` does not tell builds which wrote no sum: it counts in the digest of a terrain, which neighbouring
+        # builds in one run share.
+        if stated.get("format") != FORMAT or stated.get("sum") is None or (key and stated.get("key") != key):
             return None
-        meta = msgspec.json.decode(text, type=Description)
+        meta = msgspec.convert(stated, Description)
         if meta != meta.sealed():
             raise TerrainError("its sum is that of another description")
         return meta

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from shared_map.array_files import Bools, Bytes, Floats
 from shared_map.terrain.pace_layers import TerrainClass, grade, gradient_of_padded, largest_part
-from shared_map.terrain.row_bands import Progress, in_bands, no_progress, padded_rows
+from shared_map.terrain.row_bands import Progress, in_bands, neighbours, no_progress, padded_rows
 from swarm.errors import TerrainError
 from swarm.grid import GridSpec
 
@@ -208,19 +208,17 @@ class Ways:
         from scipy.sparse import csr_array
         from scipy.sparse.csgraph import dijkstra
 
-        rows, cols = price.shape
         cells, price = np.arange(price.size, dtype=np.int32).reshape(price.shape), price.astype(np.float64)
         steps = []
         # East, south, and both diagonals to the south: each pair of neighbours once, walked both ways.
         for down, right in ((0, 1), (1, 0), (1, 1), (1, -1)):
-            here = np.s_[: rows - down, max(-right, 0) : cols - max(right, 0)]
-            there = np.s_[down:, max(right, 0) : cols + min(right, 0)]
+            here, there = neighbours(price.shape, down, right)
             cost = (price[here] + price[there]) * (0.5 * np.hypot(down, right))
             open_ = np.isfinite(cost)
             steps.append((cost[open_], cells[here][open_], cells[there][open_]))
         costs, tails, heads = (np.concatenate(each) for each in zip(*steps, strict=True))
         graph = csr_array((costs, (tails, heads)), shape=(price.size, price.size))
-        from_cell = start[0] * cols + start[1]
+        from_cell = start[0] * price.shape[1] + start[1]
         cost, self._before = dijkstra(graph, directed=False, indices=from_cell, return_predecessors=True)
         self.cost: NDArray[np.float64] = cost.reshape(price.shape)
         """float64 (rows, cols); inf where no way leads"""
@@ -462,33 +460,15 @@ def _drawn(laid: Bools, stride: int, pace: Floats) -> Bools:
     road = np.zeros(pace.shape, np.bool_)
     half = stride // 2
     for dr, dc in ((0, 1), (1, 0), (1, 1), (1, -1)):
-        rows, cols = laid.shape
-        here = laid[: rows - dr, max(-dc, 0) : cols - max(dc, 0)]
-        there = laid[dr:, max(dc, 0) : cols + min(dc, 0)]
-        at_row, at_col = np.nonzero(here & there)
+        here, there = neighbours(laid.shape, dr, dc)
+        at_row, at_col = np.nonzero(laid[here] & laid[there])
         at_col = at_col + max(-dc, 0)
         for step in range(stride + 1):
             road[at_row * stride + half + dr * step, at_col * stride + half + dc * step] = True
     return road & np.isfinite(pace)
 
 
-TINT = np.array(
-    [
-        [122, 118, 100],  # UNKNOWN
-        [42, 74, 98],  # WATER
-        [58, 84, 46],  # FOREST
-        [138, 130, 120],  # ROCK
-        [126, 142, 78],  # GRASS
-        [156, 134, 98],  # SOIL
-        [186, 178, 164],  # ROAD
-        [164, 122, 108],  # BUILT
-        [236, 240, 244],  # SNOW
-        [104, 116, 66],  # SHRUB
-        [88, 108, 94],  # WETLAND
-    ],
-    np.uint8,
-)
-"""Natural colours of the classes, as in a photograph."""
+TINT = np.array([kind.tint for kind in TerrainClass], np.uint8)
 
 
 def synthetic_elevation(rows: int, cols: int, relief_m: float, seed: int) -> Floats:

@@ -251,68 +251,46 @@ class Level:
 
 def level_of(terrain: Terrain, most_cells: int) -> Level:
     """Returns the finest level that has at most this number of cells."""
-    colours, pace = (terrain.photo, terrain.classes), terrain.pace_s_per_m
-    level = Level(1, terrain.grid, terrain.elevation_m, *colours, pace, np.isinf(pace).astype(np.float32))
-    while level.grid.cells > most_cells:
-        level = _coarser(level)
-    return level
+    fine, side = terrain.grid, 1
+    while -(-fine.rows // side) * -(-fine.cols // side) > most_cells:
+        side *= 2
+    lethal = np.isinf(terrain.pace_s_per_m)
+    if side == 1:
+        layers = terrain.elevation_m, terrain.photo, terrain.classes, terrain.pace_s_per_m
+        return Level(1, fine, *layers, lethal.astype(np.float32))
+    cells = _total(np.ones(fine.shape, np.int32), side)
+    passable = _total(~lethal, side)
+    colours = (_total(terrain.photo, side) + cells[..., None] // 2) // cells[..., None]
+    of_classes = [_total(terrain.classes == kind, side) for kind in TerrainClass]
+    is_road = of_classes[TerrainClass.ROAD] > 0
+    rows, cols = cells.shape
+    grid = GridSpec(rows, cols, side * fine.resolution_m, fine.west_m, fine.north_m, fine.crs)
+    return Level(
+        side,
+        grid,
+        _mean(terrain.elevation_m, ~np.isnan(terrain.elevation_m), side, np.nan),
+        colours.astype(np.uint8),
+        np.where(is_road, TerrainClass.ROAD, np.argmax(of_classes, axis=0)).astype(np.uint8),
+        _mean(terrain.pace_s_per_m, ~lethal, side, np.inf),
+        np.float32(1) - (passable / cells).astype(np.float32),
+    )
 
 
 def any_in_blocks(cells: Bools, side: int) -> Bools:
     """Returns which blocks of `side` x `side` cells contain any of these cells: bool, at the resolution of the
     level."""
-    if side == 1:
-        return cells
-    rows, cols = cells.shape
-    padded = np.pad(cells, ((0, -rows % side), (0, -cols % side)))
-    blocks = padded.reshape(-(-rows // side), side, -(-cols // side), side)
-    return np.asarray(blocks.any(axis=(1, 3)), np.bool_)
+    return cells if side == 1 else _total(cells, side) > 0
 
 
-def _coarser(fine: Level) -> Level:
-    grid = fine.grid
-    half = GridSpec(
-        -(-grid.rows // 2), -(-grid.cols // 2), 2 * grid.resolution_m, grid.west_m, grid.north_m, grid.crs
-    )
-    shares = [np.float32(1) - corner for corner in _corners(fine.lethal_share)]
-    driven = np.asarray(sum(shares), np.float32)
-    colours = sum(corner.astype(np.uint16) for corner in _corners(fine.photo))
-    return Level(
-        2 * fine.side,
-        half,
-        _mean(_corners(fine.elevation_m), np.float32(np.nan)),
-        np.asarray((colours + 2) // 4, np.uint8),
-        _commonest(_corners(fine.classes)),
-        _mean(_corners(fine.pace_s_per_m), np.float32(np.inf), shares),
-        np.float32(1) - driven / np.float32(4),
-    )
+def _mean(values: Floats, where: Bools, side: int, without: float) -> Floats:
+    """The mean of these cells in each block; `without` where there is none."""
+    count, total = _total(where, side), _total(np.where(where, values, np.float32(0)), side)
+    return np.where(count > 0, total / np.maximum(count, 1), without).astype(np.float32)
 
 
-def _corners(values: NDArray[Any]) -> list[NDArray[Any]]:
-    """The four cells of each 2 x 2 block; at an odd border the last row or column counts twice."""
-    rows, cols = values.shape[:2]
-    pads = [(0, rows % 2), (0, cols % 2)] + [(0, 0)] * (values.ndim - 2)
-    even = np.pad(values, pads, mode="edge") if rows % 2 or cols % 2 else values
-    return [even[0::2, 0::2], even[0::2, 1::2], even[1::2, 0::2], even[1::2, 1::2]]
-
-
-def _mean(corners: list[Floats], without: np.float32, weights: list[Floats] | None = None) -> Floats:
-    """Weighted mean of the finite corners; `without` where none is finite."""
-    total, weight = (np.zeros(corners[0].shape, np.float32) for _ in range(2))
-    for number, corner in enumerate(corners):
-        share = np.isfinite(corner).astype(np.float32)
-        if weights is not None:
-            share *= weights[number]
-        total += np.where(share > 0, corner, np.float32(0)) * share
-        weight += share
-    mean = np.full_like(total, without)
-    np.divide(total, weight, out=mean, where=weight > 0)
-    return mean
-
-
-def _commonest(corners: list[Bytes]) -> Bytes:
-    """Returns the most common of four classes: one that occurs twice, else the first; road beats all."""
-    a, b, c, d = corners
-    common = np.where((b == c) | (b == d), b, np.where(c == d, c, a))
-    road = np.uint8(TerrainClass.ROAD)
-    return np.where((a == road) | (b == road) | (c == road) | (d == road), road, common)
+def _total(values: NDArray[Any], side: int) -> NDArray[Any]:
+    """The sum of each block, which at the border may have fewer cells; whole numbers for what is none."""
+    kind = values.dtype if values.dtype.kind == "f" else np.int32
+    for axis in (1, 0):
+        values = np.add.reduceat(values, np.arange(0, values.shape[axis], side), axis, kind)
+    return values

@@ -97,8 +97,7 @@ class Burnt:
 
 def burn_zone(zone: ZoneConfig, grid: GridSpec, where: str) -> Burnt:
     """The cells of a zone that a file draws. Raises TerrainError with one sentence, which `where` begins."""
-    assert zone.file is not None
-    path = Path(zone.file)
+    path = Path(zone.file or "")
     what = f"{where} {path}"
     if not is_vector(path) and is_raster(path):
         return _friction(zone, path, grid, where)

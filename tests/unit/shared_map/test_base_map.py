@@ -15,7 +15,7 @@ from support.makers import run_info
 from support.swarm_model import SwarmModel
 
 from launch_scripts.launcher import fetched_terrain
-from shared_map.keeper.base_map import LAYERS, NEEDED, BaseMapCopy, BaseMapServer, describe, fetch_base_map, pack
+from shared_map.keeper.base_map import LAYERS, NEEDED, BaseMapCopy, BaseMapServer, fetch_base_map
 from shared_map.keeper.mark_store import KeeperStore
 from shared_map.terrain.store import load_prepared
 from shared_map.terrain.terrain import Terrain, build_terrain
@@ -34,15 +34,23 @@ SCENARIO = Scenario(
 )
 """2 x 3 regions, those in the south and east cut off; ground and prior pace differ."""
 TERRAIN = build_terrain(SCENARIO)
+SERVER = BaseMapServer(TERRAIN, "0")
 EVERY = tuple(LAYERS)
 
 
 def copied(layers: tuple[str, ...] = EVERY) -> BaseMapCopy:
-    return BaseMapCopy(describe(TERRAIN, "0"), TERRAIN.digest, layers)
+    return BaseMapCopy(SERVER.described, TERRAIN.digest, layers)
+
+
+def complete(layers: tuple[str, ...]) -> BaseMapCopy:
+    copy = copied(layers)
+    for tile in pieces(layers):
+        copy.take(tile)
+    return copy
 
 
 def pieces(layers: tuple[str, ...] = EVERY) -> list[BaseMapTile]:
-    return [pack(TERRAIN, layer, region) for layer in layers for region in range(TERRAIN.grid.regions)]
+    return [SERVER.pack(layer, region) for layer in layers for region in range(TERRAIN.grid.regions)]
 
 
 def same(one: Terrain, other: Terrain) -> bool:
@@ -63,10 +71,7 @@ def test_a_terrain_in_pieces_in_any_order_and_twice_is_the_same_terrain(parts, a
 
 
 def test_without_its_photo_the_terrain_is_as_good_to_drive_on() -> None:
-    copy = copied(NEEDED)
-    for tile in pieces(NEEDED):
-        copy.take(tile)
-    made = copy.terrain(SCENARIO.cost)
+    made = complete(NEEDED).terrain(SCENARIO.cost)
     assert made.digest == TERRAIN.digest
     assert not made.photo.any()
 
@@ -78,7 +83,7 @@ def test_without_its_photo_the_terrain_is_as_good_to_drive_on() -> None:
         ({"data": zlib.compress(b"")}, "has 0 bytes or no end, expected 262144"),
         ({"data": zlib.compress(bytes(1 << 28))}, "has more than 262144 bytes, expected 262144"),
         ({"data": zlib.compress(bytes(262144))}, "is not as its digest says"),
-        ({"data": pack(TERRAIN, "ground", 0).data[:-9]}, "expected 262144"),
+        ({"data": SERVER.pack("ground", 0).data[:-9]}, "expected 262144"),
         ({"region": 6}, "unrequested: layer 'ground', region 6"),
         ({"layer": "gold"}, "unrequested: layer 'gold', region 0"),
         ({"region": 1}, "expected|digest"),
@@ -86,7 +91,7 @@ def test_without_its_photo_the_terrain_is_as_good_to_drive_on() -> None:
 )
 def test_a_false_piece_is_refused_in_a_sentence_and_the_true_one_still_taken(change, says):
     copy = copied()
-    true = pack(TERRAIN, "ground", 0)
+    true = SERVER.pack("ground", 0)
     with pytest.raises(ProtocolError, match=says):
         copy.take(msgspec.structs.replace(true, **change))
     assert copy.take(true)
@@ -100,19 +105,16 @@ def test_no_bytes_pass_for_a_piece(data: bytes) -> None:
 
 def test_a_description_of_another_terrain_or_of_too_much_is_refused() -> None:
     with pytest.raises(TerrainError, match=f"keeper 0 is terrain {TERRAIN.digest}, the run has fedcba"):
-        BaseMapCopy(describe(TERRAIN, "0"), "fedcba")
+        BaseMapCopy(SERVER.described, "fedcba")
     with pytest.raises(ValueError, match="65536 x 65536 cells are more than 268435456"):
-        msgspec.structs.replace(describe(TERRAIN, "0"), rows=1 << 16, cols=1 << 16)
+        msgspec.structs.replace(SERVER.described, rows=1 << 16, cols=1 << 16)
     with pytest.raises(TerrainError, match="lacks the layer ground: it has classes"):
-        BaseMapCopy(msgspec.structs.replace(describe(TERRAIN, "0"), digests={"classes": bytes(48)}), TERRAIN.digest)
+        BaseMapCopy(msgspec.structs.replace(SERVER.described, digests={"classes": bytes(48)}), TERRAIN.digest)
 
 
 def test_other_cost_rules_make_another_terrain_and_are_told_of() -> None:
-    copy = copied(NEEDED)
-    for tile in pieces(NEEDED):
-        copy.take(tile)
     with pytest.raises(TerrainError, match=r"are the \[cost\] sections of the scenarios the same"):
-        copy.terrain(CostConfig(vehicle_radius_m=40.0, max_slope_deg=20.0))
+        complete(NEEDED).terrain(CostConfig(vehicle_radius_m=40.0, max_slope_deg=20.0))
 
 
 def test_where_a_mask_lies_makes_no_other_terrain(tmp_path: Path) -> None:
@@ -183,8 +185,8 @@ class Liar(BaseMapServer):
         super().__init__(TERRAIN, "0")
         self.also = also
 
-    def _pack(self, layer: str, region: int) -> BaseMapTile:
-        true = super()._pack(layer, region)
+    def pack(self, layer: str, region: int) -> BaseMapTile:
+        true = super().pack(layer, region)
         return true if self.also and region % 2 else BaseMapTile(layer=layer, region=region, data=b"lies")
 
 

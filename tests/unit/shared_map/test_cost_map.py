@@ -11,7 +11,6 @@ from numpy.typing import NDArray
 from shared_map.cost_map import MAX_WINDOWS, CostMap, cluster, merged
 from shared_map.terrain.pace_layers import inflate, inflation_halves, spread
 from shared_map.terrain.terrain import Terrain, terrain_of_pace
-from swarm.errors import OutsideGridError
 from swarm.grid import Window
 from swarm.wire.messages.map_data import MarkKind
 
@@ -105,7 +104,7 @@ def test_a_snapshot_does_not_see_later_marks() -> None:
 
 
 def test_a_mark_outside_the_grid_is_a_bug_and_raises() -> None:
-    with pytest.raises(OutsideGridError):
+    with pytest.raises(IndexError):
         CostMap(terrain()).apply(*marks((ROWS * COLS, MarkKind.LETHAL, 0.0)))
 
 

@@ -164,9 +164,9 @@ def osm(ways: str) -> str:
     return f'<?xml version="1.0"?><osm version="0.6">{nodes}{ways}</osm>'
 
 
-def way(*nodes: int) -> str:
+def way(*nodes: int, says: str = "") -> str:
     refs = "".join(f'<nd ref="{n}"/>' for n in nodes)
-    return f'<way id="7">{refs}<tag k="natural" v="water"/></way>'
+    return f'<way id="7" {says}>{refs}<tag k="natural" v="water"/></way>'
 
 
 def plan(polygons: list[Any], circles: list[Any] | None = None, **more: Any) -> str:
@@ -230,6 +230,10 @@ DAMAGED = {
     "linked kml": kml("<NetworkLink><Link><href>http://127.0.0.1:9/a.kml</href></Link></NetworkLink>"),
     "kml cut off": kml(placemark(RING))[:-20],
     "osm without a node": osm(way(1, 2, 99, 4, 1)),
+    "osm of an open area": osm(way(1, 2, 4, 3)),
+    "osm of a deleted way": osm(way(1, 2, 3, 1, says='action="delete"')),
+    "osm as PBF": "\0\0\0\r\n\tOSMHeader",
+    "osm as JSON": '{"version": 0.6, "generator": "Overpass API", "elements": []}',
     "osm of words": osm(way(1, 2, 3, 4, 1)).replace('lat="', 'lat="N'),
     "gpx of words": '<?xml version="1.0"?><gpx version="1.1"><wpt lat="46" lon="x"/></gpx>',
     "gpx without places": '<?xml version="1.0"?><gpx version="1.1"></gpx>',
@@ -249,6 +253,8 @@ DAMAGED = {
     "waypoints of parts": waypoints(*((5002, 4.5, corner) for corner in CORNERS)),
     "waypoints of words": waypoints(*((5002, 4, corner) for corner in CORNERS)).replace("\t0\t3\t", "\tx\t3\t"),
     "circle of nothing": waypoints((5004, 0, MIDDLE)),
+    "fen": "#saved by Mission Planner\n46.9\t9\n",
+    "poly": "none\n1\n   9.0  46.9\n   9.1 46.9\nEND\nEND\n",
     "parquet": "PAR1....",
     "inav": "geozone 0 1 0 0 0 0 0 4\n",
 }
@@ -269,6 +275,12 @@ REASONS = {
     "kml of two shapes": "a Placemark has 2 of Point, LineString",
     "system unknown": "its crs 'EPSG:99999' is no coordinate system; write EPSG:32632",
     "zip": r"is damaged or no \.zip",
+    "osm of an open area": "way 7 is an area, but its ring is not closed",
+    "osm of a deleted way": "way 7 is deleted, but still in the file",
+    "osm as PBF": "osmium cat",
+    "osm as JSON": "an answer of Overpass as JSON",
+    "fen": r"fence of Mission Planner .* save it as \.waypoints",
+    "poly": "an area of Osmosis",
 }
 
 
@@ -344,11 +356,15 @@ def test_a_stated_extent_is_closed_up_to_its_edge(tmp_path: Path, tags: dict[str
 
 
 @pytest.mark.parametrize(
-    "tags", [{"radius": "wide"}, {"radius_nm": 3}, {"Radius": -5}, {"width": 20_000}, {"radius": [1, 2]}]
+    "tags",
+    [{"radius": "wide"}, {"radius_nm": 3}, {"Radius": -5}, {"width": 20_000}, {"radius": [1, 2]}, {"buffer_m": 50}],
 )
 def test_an_extent_that_cannot_be_read_is_refused_by_name(tmp_path: Path, tags: dict[str, Any]) -> None:
     file = geojson(tmp_path / "a.geojson", [feature(shapely.Point(15.5, 14.5), **tags)])
-    with pytest.raises(TerrainError, match=f"feature 0 cannot be used: its {next(iter(tags)).lower()} is"):
+    words = (
+        f"feature 0 cannot be used: its {next(iter(tags)).lower()} is .*, expected metres as radius, diameter or"
+    )
+    with pytest.raises(TerrainError, match=words):
         painted([ZoneConfig(kind="forbidden", file=file)])
 
 

@@ -161,9 +161,8 @@ def test_a_setting_that_a_refusal_names_leads_to_the_same_map(tmp_path: Path, si
 def test_control_points_place_a_raster(tmp_path: Path) -> None:
     corners = [(0, 0), (0, COLS), (ROWS, 0), (ROWS, COLS)]
     points = [GroundControlPoint(r, c, WEST + 10 * c, NORTH - 10 * r) for r, c in corners]
-    write_raster(tmp_path / "a.tif", 10.0, transform=None, crs=None)
-    with rasterio.open(tmp_path / "a.tif", "r+") as file:
-        file.gcps = points, rasterio.CRS.from_string(UTM)
+    gcps = points, rasterio.CRS.from_string(UTM)
+    write_raster(tmp_path / "a.tif", 10.0, transform=None, crs=None, gcps=gcps)
     source = load(tmp_path / "a.tif")
     assert source.grid.crs == UTM
     assert abs(source.grid.west_m - WEST) < 10
@@ -182,9 +181,7 @@ def test_a_pipe_is_refused_at_once(tmp_path: Path, ending: str) -> None:
 
 def test_depths_are_turned_into_heights(tmp_path: Path) -> None:
     write_raster(tmp_path / "a.tif", 10.0, crs="EPSG:32632+5715")
-    write_raster(tmp_path / "b.tif", 10.0)
-    with rasterio.open(tmp_path / "b.tif", "r+") as file:
-        file.update_tags(1, positive="down")
+    write_raster(tmp_path / "b.tif", 10.0, band_tags={"positive": "down"})
     copy(tmp_path / "b.tif", tmp_path / "b.nc", driver="netCDF")
     for name in ("a.tif", "b.nc"):
         source = load(tmp_path / name)
@@ -234,9 +231,8 @@ def test_numbers_of_every_kind_are_read_or_refused_at_every_door(tmp_path: Path,
 def test_colours_are_looked_up_in_a_palette_of_any_length(tmp_path: Path) -> None:
     write_raster(tmp_path / "dem.tif", 10.0)
     place = {"crs": UTM, "transform": from_origin(WEST, NORTH, 10, 10)}
-    file = written(tmp_path / "a.tif", np.full(HEIGHTS.shape, 300), "uint16", **place)
-    with rasterio.open(file, "r+") as dataset:
-        dataset.write_colormap(1, {300: (90, 80, 70, 255)})
+    colours = {300: (90, 80, 70, 255)}
+    file = written(tmp_path / "a.tif", np.full(HEIGHTS.shape, 300), "uint16", colours=colours, **place)
     np.testing.assert_array_equal(load(tmp_path / "dem.tif", photo=str(file)).photo[..., 1], 80)
 
 

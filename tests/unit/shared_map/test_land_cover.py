@@ -5,7 +5,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import rasterio
 from rasterio.transform import from_origin
 from support.height_models import SIDE, hills, load, said, written
 
@@ -80,10 +79,10 @@ def test_an_ambiguous_map_is_asked_for(tmp_path: Path) -> None:
 @pytest.mark.parametrize("evidence", ["metadata", "file name"])
 def test_a_table_is_known_by_what_the_file_says_of_itself(tmp_path: Path, dem: Path, evidence: str) -> None:
     codes = patches([11, 21, 31, 41, 42, 43])
-    path = written(tmp_path / ("nlcd_2021.tif" if evidence == "file name" else "a.tif"), codes, "uint8")
-    with rasterio.open(path, "r+") as file:
-        if evidence == "metadata":
-            file.update_tags(title="National Land Cover Database 2021")
+    name, title = (
+        ("nlcd_2021.tif", "") if evidence == "file name" else ("a.tif", "National Land Cover Database 2021")
+    )
+    path = written(tmp_path / name, codes, "uint8", tags={"title": title})
     source = load(dem, cover=str(path))
     np.testing.assert_array_equal(source.classes, expected(codes, "nlcd")[0])
     assert said(source.notes, "land cover: NLCD, known by its name or metadata")
@@ -186,11 +185,9 @@ def test_no_code_is_made_up_by_resampling(tmp_path: Path, system: str, step: flo
 def test_what_lies_beside_the_map_or_under_its_mask_is_unknown(tmp_path: Path, dem: Path) -> None:
     codes = patches([10, 30, 50, 60, 80], seed=3)
     place = from_origin(502_000, 5_000_000, 20, 20)
-    path = written(tmp_path / "cover.tif", codes, "uint8", transform=place)
-    with rasterio.open(path, "r+") as file:
-        mask = np.full((SIDE, SIDE), 255, np.uint8)
-        mask[:50] = 0
-        file.write_mask(mask)
+    mask = np.full((SIDE, SIDE), 255, np.uint8)
+    mask[:50] = 0
+    path = written(tmp_path / "cover.tif", codes, "uint8", transform=place, mask=mask)
     cover = read_cover(path, load(dem).grid, TerrainConfig(cover_codes="worldcover"))
     assert not cover.known[:, :100].any()
     assert not cover.known[:50].any()
@@ -236,17 +233,11 @@ def test_a_map_of_codes_alone_is_level_ground_with_classes(tmp_path: Path) -> No
     with pytest.raises(TerrainError, match=r"'worldcover' if it is land cover, .* = 'metres' if heights"):
         load(path)
     assert load(path, elevation_encoding="metres").elevation_m.max() == 100
-    for source in (load(path, cover_codes="worldcover"), load(_tagged(path, tmp_path / "b.tif"))):
+    tagged = written(tmp_path / "b.tif", codes, "uint8", tags={"product": "ESA WorldCover 10m"})
+    for source in (load(path, cover_codes="worldcover"), load(tagged)):
         np.testing.assert_array_equal(source.classes, expected(codes, "worldcover")[0])
         assert (source.elevation_m == 0).all()
         assert said(source.notes, "there are no heights")
-
-
-def _tagged(path: Path, to: Path) -> Path:
-    to.write_bytes(path.read_bytes())
-    with rasterio.open(to, "r+") as file:
-        file.update_tags(product="ESA WorldCover 10m")
-    return to
 
 
 def test_heights_in_whole_metres_are_heights(tmp_path: Path) -> None:
@@ -261,9 +252,8 @@ def test_heights_in_whole_metres_are_heights(tmp_path: Path) -> None:
 
 
 def test_a_palette_of_unknown_codes_is_asked_for(tmp_path: Path) -> None:
-    path = written(tmp_path / "a.tif", patches([1, 2, 3, 200]), "uint8")
-    with rasterio.open(path, "r+") as file:
-        file.write_colormap(1, {n: (n, 255 - n, 77, 255) for n in range(256)})
+    colours = {n: (n, 255 - n, 77, 255) for n in range(256)}
+    path = written(tmp_path / "a.tif", patches([1, 2, 3, 200]), "uint8", colours=colours)
     with pytest.raises(TerrainError, match=r"has a palette, and its codes \(1, 2, 3, 200\).*'metres' if heights"):
         load(path)
     assert load(path, elevation_encoding="metres").elevation_m.max() == 200

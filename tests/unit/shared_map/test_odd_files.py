@@ -9,18 +9,18 @@ from typing import Any
 import numpy as np
 import pytest
 import rasterio
-import shapely
 from hypothesis import given
 from hypothesis import strategies as st
 from PIL import Image
 from rasterio.enums import ColorInterp
 from rasterio.shutil import copy
-from support.height_models import hills, load, written
-from support.zone_shapes import UTM, feature, geojson, painted
+from rasterio.transform import Affine, from_origin
+from support.height_models import SIDE, hills, is_water, load, written
 
+from shared_map.array_files import Floats
 from shared_map.importers.raster_files import _HEADER_WORD
 from shared_map.importers.water_and_voids import level_ground
-from swarm.config.ground import ZoneConfig
+from shared_map.terrain.pace_layers import TerrainClass
 from swarm.errors import TerrainError
 
 pytestmark = pytest.mark.filterwarnings("ignore::rasterio.errors.NotGeoreferencedWarning")
@@ -73,21 +73,9 @@ def with_alpha(path: Path, dtype: str, **profile: Any) -> Path:
     return written(path, bands, dtype, alpha="yes", **profile)
 
 
-def masked(path: Path) -> Path:
-    with rasterio.open(written(path, GROUND, nodata=-1.0), "r+") as file:
-        file.write_mask(opaque())
-    return path
-
-
 def lossy(path: Path) -> Path:
     copy(written(path.with_suffix(".tif"), GROUND, "int16"), path.with_suffix(".jp2"), driver="JP2OpenJPEG")
     return path.with_suffix(".jp2")
-
-
-def in_unit(path: Path, unit: str) -> Path:
-    with rasterio.open(written(path, GROUND), "r+") as file:
-        file.units = (unit,)
-    return path
 
 
 def said(path: Path, name: str, content: str | bytes) -> Path:
@@ -99,10 +87,14 @@ ASC = "ncols 3\nnrows 2\nxllcorner 0\nyllcorner 0\ncellsize 5\nNODATA_value -999
 REFUSED: dict[str, tuple[Callable[[Path], Path], str]] = {
     "alpha of floats": (lambda p: with_alpha(p, "float32"), "has an alpha band of float32, expected bytes"),
     "alpha and a value": (lambda p: with_alpha(p, "uint8", nodata=0), r"a no-data value \(0\) and a mask or alpha"),
-    "mask and a value": (masked, r"a no-data value \(-1\) and a mask"),
+    "mask and a value": (
+        lambda p: written(p, GROUND, nodata=-1.0, mask=opaque()), r"a no-data value \(-1\) and a mask",
+    ),
     "lossy JPEG 2000": (lossy, "is compressed with loss, expected exact numbers"),
     "lossy LERC": (lambda p: written(p, GROUND, compress="lerc", MAX_Z_ERROR=1.0), "is compressed with loss"),
-    "unknown unit": (lambda p: in_unit(p, "0.1 m"), r"heights in '0\.1 m', an unknown unit; set terrain\.height"),
+    "unknown unit": (
+        lambda p: written(p, GROUND, units=("0.1 m",)), r"heights in '0\.1 m', an unknown unit; set terrain\.h",
+    ),
     "colours": (lambda p: written(p, np.stack([GROUND] * 3), "uint8"), "gdal_calc.py unpacks heights from colours"),
     "no place": (
         lambda p: written(p, GROUND, transform=None), r"how large a cell is; set terrain\.resolution_m",
@@ -136,7 +128,7 @@ def test_a_terrain_is_refused_by_what_it_holds(tmp_path: Path, name: str) -> Non
 def test_a_setting_that_is_named_leads_to_a_load(tmp_path: Path) -> None:
     for unit, metres in (("0.1 m", 0.1), ("yards", 1.0), ("decimeters", None)):
         factor = {"yards": 0.9144, "decimeters": 0.1}.get(unit, 1.0) * (metres or 1.0)
-        heights_m = load(in_unit(tmp_path / "a.tif", unit), height_scale=metres).elevation_m
+        heights_m = load(written(tmp_path / "a.tif", GROUND, units=(unit,)), height_scale=metres).elevation_m
         np.testing.assert_allclose(heights_m, GROUND * factor, rtol=1e-5)
     source = load(written(tmp_path / "b.tif", GROUND, transform=None), resolution_m=5.0)
     np.testing.assert_array_equal(source.elevation_m, GROUND)
@@ -182,9 +174,9 @@ def test_a_photo_that_cannot_be_meant_is_refused(tmp_path: Path) -> None:
             load(dem, photo=str(path))
     shutil.copy(picture(tmp_path / "p.png", COLOURS), tmp_path / "bare.png")
     assert any("has no place of its own" in note for note in load(dem, photo=str(tmp_path / "bare.png")).notes)
-    with rasterio.open(written(tmp_path / "bgr.tif", bands.clip(0, 255), "uint8"), "r+") as file:
-        file.colorinterp = (ColorInterp.blue, ColorInterp.green, ColorInterp.red)
-    photo = load(dem, photo=str(tmp_path / "bgr.tif")).photo
+    order = ColorInterp.blue, ColorInterp.green, ColorInterp.red
+    backwards = written(tmp_path / "bgr.tif", bands.clip(0, 255), "uint8", colorinterp=order)
+    photo = load(dem, photo=str(backwards)).photo
     np.testing.assert_array_equal(photo, np.moveaxis(bands.clip(0, 255)[::-1], 0, -1))
 
 
@@ -195,45 +187,75 @@ def test_no_level_patch_of_a_small_file_becomes_ground_in_silence(side: int) -> 
     assert found.mask.any() or found.uncertain > 0.001
 
 
-# --- zones ----------------------------------------------------------------------------------------------------
-
-BOX, INNER, CORE = shapely.box(5.2, 5.2, 25.2, 25.2), shapely.box(8.2, 8.2, 22.2, 22.2), shapely.box(12, 12, 15, 15)
-NODES = "".join(f'<node id="{n}" lat="{46.94 + n % 2 / 1e3}" lon="{9.001 + n // 2 / 1e3}"/>' for n in range(4))
-
-
-def osm(refs: list[int], tag: str) -> str:
-    nodes = "".join(f'<nd ref="{n}"/>' for n in refs)
-    return f'<?xml version="1.0"?><osm version="0.6">{NODES}<way id="7">{nodes}{tag}</way></osm>'
-
-
-def test_an_island_in_a_hole_is_closed_and_a_hole_in_a_hole_is_asked_about(tmp_path: Path) -> None:
-    nested = shapely.MultiPolygon([BOX.difference(INNER), CORE])
-    pace, _ = painted([ZoneConfig(kind="forbidden", file=geojson(tmp_path / "a.geojson", [feature(nested)]))])
-    assert pace[13, 13] == pace[6, 6] == np.inf
-    assert pace[10, 10] < np.inf
-    rings = shapely.Polygon(BOX.exterior, [INNER.exterior, CORE.exterior])
-    with pytest.raises(TerrainError, match=r"feature 0 cannot be used: a hole of it lies in another"):
-        painted([ZoneConfig(kind="forbidden", file=geojson(tmp_path / "b.geojson", [feature(rings)]))])
+# --- systems, units and images of others ----------------------------------------------------------------------
 
 
 @pytest.mark.parametrize(
-    ("text", "words"),
+    ("system", "step"),
     [
-        (osm([0, 1, 3, 2], '<tag k="natural" v="water"/>'), "way 7 is an area, but its ring is not closed"),
-        (osm([0, 1], "").replace("<way", '<way action="delete"'), "way 7 is deleted, but still in the file"),
-        ("#saved by Mission Planner\n46.9\t9\n", r"fence of Mission Planner .* save it as \.waypoints"),
-        ("none\n1\n   9.0  46.9\n   9.1 46.9\nEND\nEND\n", "an area of Osmosis"),
-        ("\0\0\0\r\n\tOSMHeader", "osmium cat"),
-        ('{"version": 0.6, "generator": "Overpass API", "elements": []}', "an answer of Overpass as JSON"),
+        ("+proj=longlat +R=1737400 +no_defs", 0.01),
+        ("+proj=stere +lat_0=-90 +lon_0=0 +R=3376200 +units=m +no_defs", 300.0),
+        ("IAU_2015:30100", 0.01),
     ],
 )
-def test_a_drawing_of_others_is_refused_by_what_helps(tmp_path: Path, text: str, words: str) -> None:
-    (tmp_path / "zone.any").write_text(text)
-    with pytest.raises(TerrainError, match=words):
-        painted([ZoneConfig(kind="forbidden", file=str(tmp_path / "zone.any"))])
+def test_other_planets_have_metres_of_their_own(tmp_path: Path, system: str, step: float) -> None:
+    from rasterio.transform import from_origin
+
+    path = written(tmp_path / "moon.tif", hills(1, 500), crs=system, transform=from_origin(0, 1, step, step))
+    source = load(path)
+    expected_m = step if step > 1 else step * np.pi / 180 * 1_737_400
+    assert source.grid.resolution_m == pytest.approx(expected_m, rel=0.02)
+    assert not np.isnan(source.elevation_m).any()
 
 
-def test_a_distance_under_another_name_is_refused(tmp_path: Path) -> None:
-    file = geojson(tmp_path / "a.geojson", [feature(shapely.Point(20.5, 20.5), buffer_m=50)])
-    with pytest.raises(TerrainError, match="its buffer_m is '50', expected metres as radius, diameter or width"):
-        painted([ZoneConfig(kind="forbidden", file=file)], UTM)
+def test_a_map_whose_metres_are_not_true_is_put_on_true_ones(tmp_path: Path) -> None:
+    place = from_origin(0, 6_700_000, 100, 100)  # latitude 60: a metre of the map to the east is half a true one
+    system = "+proj=eqc +lat_ts=0 +lon_0=0 +datum=WGS84 +units=m"
+    source = load(written(tmp_path / "a.tif", hills(1, 500), crs=system, transform=place))
+    assert source.grid.cols * source.grid.resolution_m == pytest.approx(SIDE * 50, rel=0.03)
+
+
+def test_pixels_that_are_square_but_for_a_rounding_are_not_resampled(tmp_path: Path) -> None:
+    ground = hills(2, 500)
+    place = Affine(20, 0, 500_000, 0, -20.00001, 5_000_000)
+    source = load(written(tmp_path / "a.tif", ground, transform=place))
+    np.testing.assert_array_equal(source.elevation_m, ground)
+
+
+@pytest.mark.parametrize(
+    ("unit", "metres"), [("cm", 0.01), ("[m]", 1), ("US_survey_foot", 1200 / 3937), ("ft (US)", 1200 / 3937)]
+)
+def test_units_are_known_however_they_are_written(tmp_path: Path, unit: str, metres: float) -> None:
+    path = written(tmp_path / "a.tif", hills(2, 500) / metres, units=(unit,))
+    np.testing.assert_allclose(load(path).elevation_m, hills(2, 500), atol=1e-3)
+    notes = load(written(tmp_path / "ft.tif", hills(2, 500), crs="EPSG:2264")).notes
+    assert any("terrain.height_scale = 0.3048" in note for note in notes)
+
+
+# --- photos that are none -----------------------------------------------------------------------------------
+
+
+def photo_of(ground: Floats) -> Any:
+    """A painted true-colour photo, uint8 (rows, cols, 3)."""
+    from shared_map.terrain.synthetic import paint_photo
+
+    return paint_photo(ground, np.full(ground.shape, TerrainClass.GRASS, np.uint8), 20.0, 1)
+
+
+@pytest.mark.parametrize("kind", ["infrared", "legend"])
+def test_nothing_is_read_from_an_image_that_is_no_true_colour_photo(tmp_path: Path, kind: str) -> None:
+    ground = np.maximum(hills(13, 900) - 300, 0).astype(np.float32)
+    true = photo_of(ground)
+    red, green = true[..., 0].astype(float), true[..., 1].astype(float)
+    infrared = np.stack([np.clip(green * 1.6, 0, 255), red * 0.7, red * 0.75], axis=-1)
+    legend = np.array([(255, 255, 100), (0, 100, 0), (0, 100, 200)])[np.digitize(ground, [1, 200])]
+    shown = {"infrared": infrared, "legend": legend}[kind].astype(np.uint8)
+    terrain = written(tmp_path / "dem.tif", ground)
+    for name, image in (("true", true), ("other", shown)):
+        written(tmp_path / f"{name}.tif", np.moveaxis(image, -1, 0), "uint8")
+    good = load(terrain, photo=str(tmp_path / "true.tif"))
+    assert not any("the photo is" in note for note in good.notes)
+    other = load(terrain, photo=str(tmp_path / "other.tif"))
+    assert any("no classes are read from it" in note for note in other.notes)
+    assert set(np.unique(other.classes)) <= {TerrainClass.UNKNOWN, TerrainClass.WATER}
+    assert is_water(other).mean() == pytest.approx((ground == 0).mean(), abs=0.03)

@@ -32,6 +32,21 @@ def test_odd_shapes_are_taken_as_what_they_enclose(tmp_path: Path) -> None:
     assert facts.file.used == 3
 
 
+def test_an_island_in_a_hole_is_closed_and_a_hole_in_a_hole_is_asked_about(tmp_path: Path) -> None:
+    box, inner, core = (
+        shapely.box(5.2, 5.2, 25.2, 25.2),
+        shapely.box(8.2, 8.2, 22.2, 22.2),
+        shapely.box(12, 12, 15, 15),
+    )
+    nested = shapely.MultiPolygon([box.difference(inner), core])
+    pace, _ = painted([ZoneConfig(kind="forbidden", file=geojson(tmp_path / "a.geojson", [feature(nested)]))])
+    assert pace[13, 13] == pace[6, 6] == np.inf
+    assert pace[10, 10] < np.inf
+    rings = shapely.Polygon(box.exterior, [inner.exterior, core.exterior])
+    with pytest.raises(TerrainError, match=r"feature 0 cannot be used: a hole of it lies in another"):
+        painted([ZoneConfig(kind="forbidden", file=geojson(tmp_path / "b.geojson", [feature(rings)]))])
+
+
 def test_a_shape_that_crosses_itself_thousands_of_times_is_named_not_waited_for(tmp_path: Path) -> None:
     rng = np.random.default_rng(3)
     scribble = shapely.Polygon(rng.uniform(5, 35, (4000, 2)))
@@ -92,21 +107,29 @@ def test_a_raster_gives_paces_or_factors_and_leaves_the_rest(tmp_path: Path) -> 
     file = raster(tmp_path / "b.tif", fine, place, "EPSG:4326")
     pace, _ = painted([ZoneConfig(kind="factor", file=file)])
     np.testing.assert_allclose(pace[20, [5, 45]], [0.2, 0.4])
-    bad = raster(tmp_path / "c.tif", values - 10, from_origin(500_100, 5_199_900, 10.0, 10.0), UTM.crs, None)
-    with pytest.raises(TerrainError, match=r"holds -11, expected a factor of 1e-06 to 1e.06, or inf if nothing"):
-        painted([ZoneConfig(kind="factor", file=bad)])
-    far = raster(tmp_path / "d.tif", values, from_origin(0, 0, 10.0, 10.0), UTM.crs)
-    with pytest.raises(TerrainError, match=r"not overlap the terrain: it covers x 0\.\.250, y -200\.\.0, the"):
-        painted([ZoneConfig(kind="factor", file=far)])
-    with pytest.raises(
-        TerrainError, match="is read as a raster, which goes with kind pace or factor, found 'road'"
+    place, nowhere = from_origin(500_100, 5_199_900, 10.0, 10.0), tmp_path / "e.tif"
+    for kind, other, words in (
+        (
+            "factor",
+            raster(tmp_path / "c.tif", values - 10, place, UTM.crs, None),
+            r"holds -11, expected a factor of 1e",
+        ),
+        (
+            "factor",
+            raster(tmp_path / "d.tif", values, from_origin(0, 0, 10.0, 10.0), UTM.crs),
+            "covers x 0..250, y -200",
+        ),
+        ("road", file, "is read as a raster, which goes with kind pace or factor, found 'road'"),
+        (
+            "factor",
+            raster(nowhere, values, place, None),
+            "does not say in which coordinate system it is; set crs, for",
+        ),
     ):
-        painted([ZoneConfig(kind="road", file=file)])
-    nowhere = raster(tmp_path / "e.tif", values, from_origin(500_100, 5_199_900, 10.0, 10.0), None)
-    with pytest.raises(TerrainError, match="does not say in which coordinate system it is; set crs, for example"):
-        painted([ZoneConfig(kind="factor", file=nowhere)])
+        with pytest.raises(TerrainError, match=words):
+            painted([ZoneConfig(kind=kind, file=other)])
     local = GridSpec(UTM.rows, UTM.cols, 10.0, UTM.west_m, UTM.north_m)
-    pace, _ = painted([ZoneConfig(kind="factor", file=nowhere, crs="local")], local)
+    pace, _ = painted([ZoneConfig(kind="factor", file=str(nowhere), crs="local")], local)
     np.testing.assert_allclose(pace[[10, 11, 12], 20], [0.1, np.inf, 0.3])
 
 

@@ -6,12 +6,10 @@ from typing import get_args
 
 import numpy as np
 import pytest
-from PIL import Image
 from support.height_models import written
 
 from shared_map.importers.terrain_sources import load_source
 from shared_map.terrain.pace_layers import (
-    CLASS_FACTOR,
     TerrainClass,
     gradient_of_padded,
     polygon_mask,
@@ -126,7 +124,7 @@ def test_a_scenario_sets_the_factor_of_a_class() -> None:
     np.testing.assert_allclose(pace, [[0.4, math.inf]])
     ignored = terrain_pace(level, classes, CostConfig(classes=False))
     np.testing.assert_allclose(ignored, [[0.1, 0.1]])
-    assert CLASS_FACTOR[TerrainClass.WATER] == math.inf
+    assert TerrainClass.WATER.factor == math.inf
 
 
 def test_a_polygon_covers_the_cells_whose_middle_lies_in_it() -> None:
@@ -140,28 +138,27 @@ def test_a_polygon_covers_the_cells_whose_middle_lies_in_it() -> None:
     assert not hole[2, 2]
 
 
-def test_a_mask_without_a_painted_cell_is_refused_by_its_name(tmp_path: Path) -> None:
-    Image.new("L", (30, 20)).save(tmp_path / "none.png")
-    with pytest.raises(TerrainError, match=r"'rough' covers no cell of the terrain: .*none\.png is 0 everywhere"):
-        zone_mask(ZoneConfig(kind="rough", mask=str(tmp_path / "none.png")), GridSpec(20, 30, 10.0))
-
-
-def test_a_zone_outside_the_terrain_is_refused_with_a_sentence() -> None:
-    far = ZoneConfig(kind="forbidden", name="swamp", polygon_m=((900, 900), (950, 900), (950, 950)))
-    with pytest.raises(TerrainError, match=r"'swamp' covers no cell.* 300 m x 200 m"):
-        zone_mask(far, GridSpec(20, 30, 10.0))
-    level = TerrainConfig(source="synthetic", rows=20, cols=30)
-    with pytest.raises(TerrainError, match="covers no cell"):
-        build_terrain(Scenario(terrain=level, cost=CostConfig(zones=(far,))))
-
-
-def test_a_zone_may_be_a_painted_mask(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("where", "size", "words"),
+    [
+        ({"mask": "none.png"}, (20, 30), r"'swamp' covers no cell of the terrain: .*none\.png is 0 everywhere"),
+        ({"mask": "m.png"}, (10, 10), "20 x 30 pixels, the terrain 10 x 10"),
+        ({"mask": "nowhere.png"}, (10, 10), "No such file"),
+        ({"polygon_m": ((900, 900), (950, 900), (950, 950))}, (20, 30), r"'swamp' covers no cell.* 300 m x 200 m"),
+    ],
+)
+def test_a_zone_may_be_a_painted_mask_and_one_of_no_cell_is_refused(tmp_path, monkeypatch, where, size, words):
+    monkeypatch.chdir(tmp_path)
     painted = np.zeros((20, 30), np.uint8)
-    painted[5:8, 5:8] = 255
-    written(tmp_path / "m.png", painted, "uint8", driver="PNG", crs=None, transform=None)
-    zone = ZoneConfig(kind="forbidden", mask=str(tmp_path / "m.png"))
-    np.testing.assert_array_equal(zone_mask(zone, GridSpec(20, 30, 10.0)), painted > 0)
-    with pytest.raises(TerrainError, match="20 x 30 pixels, the terrain 10 x 10"):
-        zone_mask(zone, GridSpec(10, 10, 10.0))
-    with pytest.raises(TerrainError, match="No such file"):
-        zone_mask(ZoneConfig(kind="road", mask="nowhere.png"), GridSpec(10, 10, 10.0))
+    for name in ("none.png", "m.png"):
+        written(tmp_path / name, painted, "uint8", driver="PNG", crs=None, transform=None)
+        painted[5:8, 5:8] = 255
+    np.testing.assert_array_equal(
+        zone_mask(ZoneConfig(kind="road", mask="m.png"), GridSpec(20, 30, 10.0)), painted > 0
+    )
+    zone = ZoneConfig(kind="rough", name="swamp", **where)
+    with pytest.raises(TerrainError, match=words):
+        zone_mask(zone, GridSpec(*size, 10.0))
+    terrain = TerrainConfig(source="synthetic", rows=size[0], cols=size[1], resolution_m=10.0)
+    with pytest.raises(TerrainError, match=words):
+        build_terrain(Scenario(terrain=terrain, cost=CostConfig(zones=(zone,))))

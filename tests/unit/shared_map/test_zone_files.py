@@ -22,6 +22,20 @@ from swarm.errors import TerrainError
 from swarm.grid import GridSpec
 
 
+def degrees_of_middles(grid: GridSpec) -> tuple[np.ndarray, np.ndarray]:
+    """(longitude, latitude) of the middle of each cell."""
+    rows, cols = np.indices(grid.shape) + 0.5
+    xs, ys = grid.west_m + grid.resolution_m * cols, grid.north_m - grid.resolution_m * rows
+    lon, lat = to_crs(grid.crs, "EPSG:4326", xs.ravel(), ys.ravel())
+    return np.reshape(lon, grid.shape), np.reshape(lat, grid.shape)
+
+
+def drawn(path: Path, geometry: object) -> str:
+    """A file of one geometry as it is, in degrees."""
+    path.write_text(json.dumps(geometry))
+    return str(path)
+
+
 @st.composite
 def blobs(draw: st.DrawFn) -> Any:
     """A star-shaped polygon with a hole, on and beyond the terrain."""
@@ -65,13 +79,7 @@ def test_lines_are_as_wide_as_they_are_and_never_broken(tmp_path_factory, corner
     file = geojson(path, [feature(line, highway="road", width=f"{width_m} m")])
     pace, _ = painted([ZoneConfig(kind="road", file=file)])
     road = pace < 0.09
-    away_m = np.full(road.shape, np.inf)
-    cols, rows = np.meshgrid(np.arange(UTM.cols) + 0.5, np.arange(UTM.rows) + 0.5)
-    for (x0, y0), (x1, y1) in pairwise(corners):  # distance of each middle to each piece
-        along = np.array([x1 - x0, y1 - y0])
-        share = ((cols - x0) * along[0] + (rows - y0) * along[1]) / max(float(along @ along), 1e-30)
-        share = np.clip(share, 0, 1)
-        away_m = np.minimum(away_m, 10 * np.hypot(cols - x0 - share * along[0], rows - y0 - share * along[1]))
+    away_m = UTM.resolution_m * shapely.distance(line, middles())
     assert road[shapely.length(shapely.intersection(line, squares())) > 1e-3].all()
     inner, outer = away_m < width_m / 2 * 0.99 - 0.01, away_m > width_m / 2 + 0.01
     assert road[inner].all()
@@ -255,12 +263,9 @@ def test_the_same_shapes_give_the_same_cells_in_every_system_and_kind_of_file(tm
 
 def test_long_edges_are_bent_as_the_map_bends_them(tmp_path: Path) -> None:
     wide = GridSpec(100, 200, 1000.0, 400_000.0, 7_100_000.0, "EPSG:32632")
-    text = {"type": "Polygon", "coordinates": [[[3, 63.5], [15, 63.5], [15, 66], [3, 66], [3, 63.5]]]}
-    (tmp_path / "a.geojson").write_text(json.dumps(text))
-    pace, _ = painted([ZoneConfig(kind="factor", factor=2.0, file=str(tmp_path / "a.geojson"))], wide)
-    cols, rows = np.meshgrid(np.arange(200) + 0.5, np.arange(100) + 0.5)
-    _, lat = to_crs(wide.crs, "EPSG:4326", (400_000 + 1000 * cols).ravel(), (7_100_000 - 1000 * rows).ravel())
-    north = np.reshape(lat, cols.shape)
+    area = {"type": "Polygon", "coordinates": [[[3, 63.5], [15, 63.5], [15, 66], [3, 66], [3, 63.5]]]}
+    pace, _ = painted([ZoneConfig(kind="factor", factor=2.0, file=drawn(tmp_path / "a.geojson", area))], wide)
+    _, north = degrees_of_middles(wide)
     clear = abs(north - 63.5) > 1e-6
     assert ((pace > 0.1) == (north > 63.5))[clear].all()
     assert 0.1 < (pace > 0.1).mean() < 0.9
@@ -275,27 +280,18 @@ def test_a_terrain_across_180_degrees_has_zones_on_both_sides(tmp_path: Path) ->
 
     cut = {"type": "MultiPolygon", "coordinates": [[ring(179.8, 180)], [ring(-180, -179.9)]]}
     beyond = {"type": "Polygon", "coordinates": [ring(179.8, 180.1)]}
-    found = []
-    for name, text in (("cut", cut), ("beyond", beyond)):
-        (tmp_path / f"{name}.geojson").write_text(json.dumps(text))
-        pace, (facts,) = painted(
-            [ZoneConfig(kind="factor", factor=2.0, file=str(tmp_path / f"{name}.geojson"))], grid
-        )
-        assert facts.file.used == 1
-        found.append(pace > 0.1)
-    cols, rows = np.meshgrid(np.arange(60) + 0.5, np.arange(40) + 0.5)
-    lon, lat = to_crs(
-        grid.crs, "EPSG:4326", (grid.west_m + 1000 * cols).ravel(), (grid.north_m - 1000 * rows).ravel()
-    )
-    lon, lat = np.reshape(lon, cols.shape) % 360, np.reshape(lat, cols.shape)
+    lon, lat = degrees_of_middles(grid)
+    lon %= 360
     inside = (lon > 179.8) & (lon < 180.1) & (lat > -17.2) & (lat < -17.1)
     assert inside.sum() > 150
-    np.testing.assert_array_equal(found[0], inside)
-    np.testing.assert_array_equal(found[1], inside)
+    for area in (cut, beyond):
+        zone = ZoneConfig(kind="factor", factor=2.0, file=drawn(tmp_path / "a.geojson", area))
+        pace, (facts,) = painted([zone], grid)
+        assert facts.file.used == 1
+        np.testing.assert_array_equal(pace > 0.1, inside)
     uncut = {"type": "Polygon", "coordinates": [ring(179.8, -179.9)]}
-    (tmp_path / "uncut.geojson").write_text(json.dumps(uncut))
     with pytest.raises(TerrainError, match=r"feature 0 cannot be used: an edge .* 180 degrees"):
-        painted([ZoneConfig(kind="forbidden", file=str(tmp_path / "uncut.geojson"))], grid)
+        painted([ZoneConfig(kind="forbidden", file=drawn(tmp_path / "a.geojson", uncut))], grid)
 
 
 @settings(max_examples=8)
