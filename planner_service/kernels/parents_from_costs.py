@@ -24,6 +24,7 @@ from planner_service.kernels.layout import (
     NONE,
     RULE_FOUR,
     diagonal_length,
+    is_shut,
     step_length,
 )
 
@@ -149,7 +150,7 @@ def _leads_on(grid, climbs, labels, v, k):
     u = v + offsets[k]
     if (odd and rule == RULE_FOUR) or not cost[u] < INF or (parent[u] == NONE and u != root):
         return False
-    if odd and not corners and max(cell_cost[v + offsets[k - 1]], cell_cost[v + offsets[(k + 1) & 7]]) == INF:
+    if odd and not corners and is_shut(cell_cost, offsets, v, k):
         return False
     return offered(cost[u], cell_cost[u], climbs, v, u, k, step_length(rule, odd)) == cost[v]
 

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from planner_service.kernels.climbs import CLIMBS, offered
 from planner_service.kernels.decorators import helper, step_kernel
-from planner_service.kernels.layout import BUCKETS, GRID, INF, LABELS, NONE, cuts_corner, diagonal_length
+from planner_service.kernels.layout import BUCKETS, GRID, INF, LABELS, NONE, diagonal_length, is_shut, leads_by
 from planner_service.kernels.parents_from_costs import point_row_to_parents
 
 _NOBODY = np.int32(-1)
@@ -268,18 +268,8 @@ def spread(grid, climbs, cost, buckets, lowered, count, rows, limit, entries, he
                     n += _ONE
                 v = u + np.uint64(offsets[2 * k + 1])
                 diagonal = offered(key, own, climbs, v, u, (2 * k + 1) ^ 4, slant)
-                if (
-                    diagonal < cost[v]
-                    and cell_cost[v] < INF
-                    and (
-                        corners
-                        or max(
-                            cell_cost[u + np.uint64(offsets[2 * k])],
-                            cell_cost[u + np.uint64(offsets[(2 * k + 2) & 7])],
-                        )
-                        < INF
-                    )
-                ):
+                lower = diagonal < cost[v] and cell_cost[v] < INF
+                if lower and (corners or not is_shut(cell_cost, offsets, u, 2 * k + 1)):
                     cost[v] = diagonal
                     lowered[n] = v
                     n += _ONE
@@ -323,14 +313,9 @@ def _detach(grid, cost, parent, changed, before, limit, detached):
             detached[count] = x
             count += 1
         for k in range(8):
-            v = x + offsets[k]
-            way = parent[v]
-            if way == NONE:
-                continue
-            closed = lethal and not corners and cuts_corner(v, way, x, offsets)
-            if closed or way == (k + 4) & 7:
-                parent[v] = NONE
-                detached[count] = v
+            if leads_by(parent, offsets, x, k, lethal and not corners):
+                parent[x + offsets[k]] = NONE
+                detached[count] = x + offsets[k]
                 count += 1
     return _detach_behind(cost, parent, offsets, detached, count, limit)
 

@@ -17,7 +17,17 @@ import numpy as np
 from planner_service.kernels import tile_pieces
 from planner_service.kernels.decorators import helper, kernel
 from planner_service.kernels.heap_and_buckets import heap_lower, heap_pop
-from planner_service.kernels.layout import BOX, GRID, INF, NONE, RULE_FOUR, RULE_OCTILE, SQRT2_EXACT, cuts_corner
+from planner_service.kernels.layout import (
+    BOX,
+    GRID,
+    INF,
+    NONE,
+    RULE_FOUR,
+    RULE_OCTILE,
+    SQRT2_EXACT,
+    is_shut,
+    leads_by,
+)
 from planner_service.kernels.piece_totals import begin, evaluate_totals, queue_checks, settle
 from planner_service.kernels.tile_pieces import BITS, CELLS, PIECES, SIDE, TOTAL, WIDE
 
@@ -106,9 +116,7 @@ def _open(own, around, rule, corners, at, code):
     """Returns True if there is a step between a passable cell on the scratch and the one in this direction."""
     if not code & 1:
         return True
-    if rule == RULE_FOUR:
-        return False
-    return corners or max(own[at + around[code - 1]], own[at + around[(code + 1) & 7]]) < np.inf
+    return rule != RULE_FOUR and (corners or not is_shut(own, around, at, code))
 
 
 @helper
@@ -233,11 +241,9 @@ def _improve_tile(t, grid, tree, tiles, scratch):
 def _is_next(t, across, schedule):
     """Returns True if no tile about this one, of those to be checked, has an earlier turn."""
     place, turn, sets = schedule.place, schedule.turn, schedule.sets
-    row, col = t // across, t % across
-    down = place.size // across
-    for i in range(max(row - 1, 0), min(row + 2, down)):
-        for j in range(max(col - 1, 0), min(col + 2, across)):
-            other = i * across + j
+    row0, col0, row1, col1 = tile_pieces.rows_about(t, across, place.size)
+    for row in range(row0, row1):
+        for other in range(row * across + col0, row * across + col1):
             if turn[other] < turn[t] and sets[tile_pieces.CHECKING, place[other]]:
                 return False
     return True
@@ -246,12 +252,11 @@ def _is_next(t, across, schedule):
 @helper
 def _any_cut_off(t, wanted, across):
     """Returns True if a piece of a tile, or of those about it, has no path."""
-    row, col = t // across, t % across
-    down = wanted.size // across
+    row0, col0, row1, col1 = tile_pieces.rows_about(t, across, wanted.size)
     what = np.uint8(0)
-    for i in range(max(row - 1, 0), min(row + 2, down)):
-        for j in range(max(col - 1, 0), min(col + 2, across)):
-            what |= wanted[i * across + j]
+    for row in range(row0, row1):
+        for other in range(row * across + col0, row * across + col1):
+            what |= wanted[other]
     return what & tile_pieces.CUT_OFF != 0
 
 
@@ -361,12 +366,8 @@ def cut_parents(grid, tree, across, cells, before, changed):
         if lethal:
             parent[changed_cell] = NONE
         for code in range(8):
-            v = changed_cell + offsets[code]
-            way = parent[v]
-            if way == NONE:
-                continue
-            into = way == (code + 4) & 7
-            if into or (lethal and not corners and cuts_corner(v, way, changed_cell, offsets)):
+            if leads_by(parent, offsets, changed_cell, code, lethal and not corners):
+                v = changed_cell + offsets[code]
                 t, _ = tile_pieces.tile_of(v, stride, across)
                 changed[t] |= what
                 if lethal:
