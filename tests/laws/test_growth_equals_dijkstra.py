@@ -1,8 +1,5 @@
 """Growth against an independent Dijkstra, on every rule; the same uncompiled and with bounds checks on."""
 
-import os
-import subprocess
-import sys
 import time
 from pathlib import Path
 
@@ -11,6 +8,7 @@ import pytest
 from support import slow_twins as naive
 from support.kernel_oracle import RATIOS, assert_equals_dijkstra, grown, loaded, random_grids
 from support.planner_strategies import RULES, random_pace
+from support.processes import words_of_python
 
 from planner_service.kernels import queue_dial, queue_wide_buckets
 from planner_service.tree.cost_grid import CostGrid
@@ -140,9 +138,5 @@ def test_kernels_do_the_same_uncompiled_and_never_leave_their_arrays(
     setting: str, count: int, tmp_path: Path
 ) -> None:
     here = Path(__file__).parents[1]
-    environment = {**os.environ, setting: "1", "NUMBA_CACHE_DIR": str(tmp_path), "PYTHONPATH": str(here.parent)}
-    script = _SMALL.format(tests=str(here), count=count)
-    done = subprocess.run(
-        [sys.executable, "-W", "ignore", "-c", script], env=environment, capture_output=True, text=True, timeout=280
-    )
-    assert done.stdout.strip() == "fine", done.stderr[-2000:]
+    environment = {setting: "1", "NUMBA_CACHE_DIR": str(tmp_path), "PYTHONPATH": str(here.parent)}
+    assert words_of_python(_SMALL.format(tests=str(here), count=count), **environment) == ["fine"]

@@ -2,7 +2,6 @@
 parents."""
 
 import os
-import subprocess
 import sys
 from unittest import mock
 
@@ -13,6 +12,7 @@ from support.effort import few
 from support.kernel_oracle import loaded, unpadded
 from support.planner_play import Play
 from support.planner_strategies import RULES, random_pace
+from support.processes import words_of_python
 
 from planner_service import growth_times
 from planner_service.kernels.layout import NONE
@@ -172,14 +172,7 @@ def test_slow_twin(how: str, count: int) -> None:
     """Uncompiled, and with every index checked, the kernels do the same."""
     program = f"from laws.test_pieces_equal_dijkstra import chases; chases(range({count}), 40, 3)"
     paths = os.pathsep.join(path for path in sys.path if path)
-    done = subprocess.run(
-        [sys.executable, "-W", "ignore", "-c", program],
-        env={**os.environ, how: "1", "PYTHONPATH": paths},
-        capture_output=True,
-        text=True,
-        timeout=300,
-    )
-    assert done.returncode == 0, done.stderr
+    words_of_python(program, **{how: "1", "PYTHONPATH": paths})
 
 
 @pytest.mark.parametrize(("strategy", "has_worker"), [("exact", False), ("exact", True), ("auto", False)])

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import contextlib
 import os
+import subprocess
+import sys
 import time
 from collections.abc import Callable
 
@@ -18,6 +20,15 @@ def session_of(leader: int) -> list[str]:
         with contextlib.suppress(psutil.Error):  # ended while we looked
             lines.append(" ".join(psutil.Process(pid).cmdline()))
     return lines
+
+
+def words_of_python(code: str, *within: str, **environment: str) -> list[str]:
+    """Runs code in a fresh Python, started by the command `within`; it must end well. Returns what it prints, by
+    words."""
+    command = [*within, sys.executable, "-W", "ignore", "-c", code]
+    done = subprocess.run(command, env=os.environ | environment, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr[-2000:]
+    return done.stdout.split()
 
 
 def eventually(
