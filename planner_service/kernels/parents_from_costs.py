@@ -32,9 +32,13 @@ _ONE = np.uint64(1)
 
 
 @helper
-def _parents_of_eight(cell_cost, cost, s, first, last, step, limit, parent, least):
-    """A diagonal counts if the more expensive of its two corners costs at most `limit`, and none where `step`, its
-    length, is inf. Free of branches: it vectorises."""
+def least_offers(cell_cost, cost, s, first, last, step, limit, parent, least):
+    """The lowest offer to each cell, and whose it is. A diagonal counts if the more expensive of its two corners
+    costs at most `limit`, and none where `step`, its length, is inf. Free of branches: it vectorises.
+
+    parent  written; None if not needed
+    least   s; written from its first element on; None if not needed
+    """
     for i in range(first, last):
         north, east, south, west = cell_cost[i - s], cell_cost[i + _ONE], cell_cost[i + s], cell_cost[i - _ONE]
         best = cost[i - s] + north
@@ -125,7 +129,7 @@ def point_row_to_parents(grid, climbs, cost, first, last, parent, least):
         _parents_by_climb(grid, climbs, cost, begin, end, parent, least)
     else:
         limit = INF if corners else HUGE
-        _parents_of_eight(cell_cost, cost, s, begin, end, diagonal_length(rule), limit, parent, least)
+        least_offers(cell_cost, cost, s, begin, end, diagonal_length(rule), limit, parent, least)
 
 
 @step_kernel(f"({GRID}, CLIMBS, f4[::1], i8, {BOX}, u1[::1])", CLIMBS)

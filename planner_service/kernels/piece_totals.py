@@ -84,8 +84,8 @@ def _meet_inside(t, tree, tiles, scratch, fine):
     than `fine` apart."""
     piece, total = tree.piece, tree.total
     exits, many = tiles.exits, tiles.many
-    less, name, changes = scratch.less, scratch.name, scratch.changes
-    # Pieces are grouped by what their totals have changed by: `less` holds the group of each name.
+    name, changes, group_of = scratch.name, scratch.changes, scratch.queue
+    # Pieces are grouped by what their totals have changed by.
     groups = 0
     for j in range(many[t]):
         one = np.int64(exits[t * PIECES + j])
@@ -98,12 +98,12 @@ def _meet_inside(t, tree, tiles, scratch, fine):
                 return True
             changes[groups] = change
             groups += 1
-        less[one] = group
-    less[tile_pieces.NO_PIECE] = np.int32(tile_pieces.NO_PIECE)
+        group_of[one] = group
+    group_of[tile_pieces.NO_PIECE] = np.int32(tile_pieces.NO_PIECE)
     for row in range(SIDE):
         i, at = np.uint64(t * CELLS + (row << BITS)), np.uint64((row + 1) * WIDE + 1)
         for col in range(np.uint64(SIDE)):
-            name[at + col] = less[piece[i + col]]
+            name[at + col] = group_of[piece[i + col]]
     for row in range(1, SIDE + 1):
         at, s = np.uint64(row * WIDE), np.uint64(WIDE)
         other = np.uint8(0)

@@ -146,8 +146,8 @@ class Scratch(NamedTuple):
     """(w,) s; cell costs."""
     inner: Doubles
     """(w,) s; offset of each cell; 0 around the tile."""
-    less: Ints
-    """(w,) whether a cell is offered less."""
+    least: Doubles
+    """(w,) s; the least that a cell is offered, from the first cell of the tile on."""
     queue: Ints
     """(w,) cells; while costs spread, the items of a heap."""
     keys: Floats
@@ -204,7 +204,7 @@ def make_scratch(tiles: int, most: int) -> Scratch:
         cost=np.full(size, np.inf),
         own=np.full(size, np.inf),
         inner=np.zeros(size),
-        less=np.zeros(size, np.int32),
+        least=np.zeros(size),
         queue=np.empty(size, np.int32),
         keys=np.zeros(size, np.float32),
         code=np.full(size, NONE),

@@ -20,6 +20,7 @@ from planner_service.kernels.heap_and_buckets import heap_lower, heap_pop
 from planner_service.kernels.layout import (
     BOX,
     GRID,
+    HUGE,
     INF,
     NONE,
     RULE_FOUR,
@@ -28,10 +29,12 @@ from planner_service.kernels.layout import (
     is_shut,
     leads_by,
 )
+from planner_service.kernels.parents_from_costs import least_offers
 from planner_service.kernels.piece_totals import begin, evaluate_totals, queue_checks, settle
 from planner_service.kernels.tile_pieces import BITS, CELLS, PIECES, SIDE, TOTAL, WIDE
 
-_ONE = np.uint64(1)
+_FIRST = np.uint64(WIDE + 1)
+"""The first cell of a tile, on the scratch."""
 _WINDOW = f"Tuple((f4[::1], u1[::1], {BOX}, f8))"
 
 
@@ -92,23 +95,10 @@ def _load_tile(t, grid, tree, tiles, scratch):
 
 
 @helper
-def _mark_improvable(cost, own, begin, end, diagonal, corners, less):
-    """less := 1 where a cell is offered less than `KEPT` of its cost, 0 elsewhere. Without a branch, so that it
-    vectorises."""
-    s = np.uint64(WIDE)
-    for i in range(begin, end):
-        north, east, south, west = own[i - s], own[i + _ONE], own[i + s], own[i - _ONE]
-        best = min(min(cost[i - s] + north, cost[i + _ONE] + east), min(cost[i + s] + south, cost[i - _ONE] + west))
-        offer = cost[i - s + _ONE] + own[i - s + _ONE] * diagonal
-        best = min(best, offer if corners or max(north, east) < np.inf else np.inf)
-        offer = cost[i + s + _ONE] + own[i + s + _ONE] * diagonal
-        best = min(best, offer if corners or max(south, east) < np.inf else np.inf)
-        offer = cost[i + s - _ONE] + own[i + s - _ONE] * diagonal
-        best = min(best, offer if corners or max(south, west) < np.inf else np.inf)
-        offer = cost[i - s - _ONE] + own[i - s - _ONE] * diagonal
-        best = min(best, offer if corners or max(north, west) < np.inf else np.inf)
-        best = best if own[i] < np.inf else np.inf
-        less[i] = 1 if best < cost[i] * tile_pieces.KEPT else 0
+def _is_offered_less(i, cost, own, least):
+    """Returns True if a cell (unsigned) on the scratch may be entered and is offered less than `KEPT` of its
+    cost."""
+    return (least[i - _FIRST] < cost[i] * tile_pieces.KEPT) & (own[i] < np.inf)
 
 
 @helper
@@ -205,22 +195,24 @@ def _improve_tile(t, grid, tree, tiles, scratch):
     _, _, _, rule, corners = grid
     piece = tree.piece
     exits, many, across = tiles.exits, tiles.many, tiles.across
-    names, cost, own, less = scratch.border, scratch.cost, scratch.own, scratch.less
+    names, cost, own, least = scratch.border, scratch.cost, scratch.own, scratch.least
     queue, keys, spot = scratch.queue, scratch.keys, scratch.spot
     _load_tile(t, grid, tree, tiles, scratch)
     _, rows, cols = tile_pieces.corner_of(grid, across, t)
     diagonal = np.inf if rule == RULE_FOUR else (SQRT2_EXACT if rule == RULE_OCTILE else 1.0)
-    _mark_improvable(*(cost, own, np.uint64(WIDE + 1), np.uint64((rows + 1) * WIDE - 1), diagonal, corners, less))
+    last, limit = np.uint64((rows + 1) * WIDE - 1), INF if corners else HUGE
+    least_offers(own, cost, np.uint64(WIDE), _FIRST, last, diagonal, limit, None, least)
     count = 0
     for row in range(rows):
         first = np.uint64((row + 1) * WIDE + 1)
         some = np.int32(0)
         for col in range(np.uint64(cols)):
-            some |= less[first + col]
+            some |= np.int32(_is_offered_less(first + col, cost, own, least))
         if some:
             for col in range(cols):
                 at = (row + 1) * WIDE + col + 1
-                if less[at] and _relax(*(at, t, (row << BITS) + col, grid, tree, tiles, scratch)):
+                less = _is_offered_less(np.uint64(at), cost, own, least)
+                if less and _relax(*(at, t, (row << BITS) + col, grid, tree, tiles, scratch)):
                     count = heap_lower(keys, queue, spot, count, np.float32(cost[at]), at)
     if count == 0:
         return False
