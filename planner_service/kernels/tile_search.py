@@ -39,32 +39,22 @@ _WINDOW = f"Tuple((f4[::1], u1[::1], {BOX}, f8))"
 
 
 @helper
-def _load_line(count, first, steps, other, grid, tree, scratch):
-    """Puts `count` cells of tile `other` on the scratch; there is no such tile where cells are lethal.
-
-    first  where the first is on the map, in its tile, on the scratch
-    steps  from one to the next, in the same order
-    """
-    cell_cost = grid[0]
-    piece, rim = tree.piece, tree.rim
-    cost, own = scratch.cost, scratch.own
-    g, cell, at = first
-    for _ in range(count):
-        own[at] = cell_cost[g]
-        cost[at] = np.inf
-        if cell_cost[g] < INF:
-            name = np.int64(piece[other * CELLS + cell])
-            at_exit = tree.total[other * PIECES + name, TOTAL]
-            cost[at] = at_exit + rim[other * PIECES + tile_pieces.border_index(cell)]
-        g += steps[0]
-        cell += steps[1]
-        at += steps[2]
+def _load_beside(t, row, col, origin, grid, tree, across, scratch):
+    """Puts a cell beside a tile on the scratch. Row and column are counted from the tile's first cell, which is
+    `origin`, padded."""
+    at, own = (row + 1) * WIDE + col + 1, grid[0][origin + row * grid[2] + col]
+    scratch.own[at] = own
+    scratch.cost[at] = np.inf
+    if own < INF:  # there is a tile
+        other = t + (row >> BITS) * across + (col >> BITS)
+        cell = ((row & (SIDE - 1)) << BITS) + (col & (SIDE - 1))
+        at_exit = tree.total[other * PIECES + np.int64(tree.piece[other * CELLS + cell]), TOTAL]
+        scratch.cost[at] = at_exit + tree.rim[other * PIECES + tile_pieces.border_index(cell)]
 
 
 @helper
 def _load_tile(t, grid, tree, tiles, scratch):
     """Puts a tile on the scratch, with the cells around."""
-    stride = grid[2]
     piece, across = tree.piece, tiles.across
     cost, inner = scratch.cost, scratch.inner
     tile_pieces.load_offsets(t, grid, tree, tiles, scratch)
@@ -78,20 +68,12 @@ def _load_tile(t, grid, tree, tiles, scratch):
         at = np.uint64((row + 1) * WIDE + 1)
         for col in range(np.uint64(cols)):
             cost[at + col] = tree.total[totals + np.uint64(piece[i + col]), TOTAL] + inner[at + col]
-    for down in range(-1, 2):
-        for right in range(-1, 2):
-            if not (down or right):
-                continue
-            # The first cell around on this side, counted from the tile's first; and how many there are.
-            row = rows if down > 0 else down
-            col = cols if right > 0 else right
-            count = 1 if down and right else (cols if down else rows)
-            other = t + down * across + right
-            cell = ((row & (SIDE - 1)) << BITS) + (col & (SIDE - 1))
-            at = (row + 1) * WIDE + col + 1
-            g = origin + row * stride + col
-            steps = (1, 1, 1) if down else (stride, SIDE, WIDE)
-            _load_line(count, (g, cell, at), steps, other, grid, tree, scratch)
+    for col in range(-1, cols + 1):
+        _load_beside(t, -1, col, origin, grid, tree, across, scratch)
+        _load_beside(t, rows, col, origin, grid, tree, across, scratch)
+    for row in range(rows):
+        _load_beside(t, row, -1, origin, grid, tree, across, scratch)
+        _load_beside(t, row, cols, origin, grid, tree, across, scratch)
 
 
 @helper
