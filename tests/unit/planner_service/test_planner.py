@@ -1,4 +1,4 @@
-"""The planner without a bus or a worker: what it grows and when, what it answers, and to whom it pushes routes."""
+"""The planner without a bus or a worker: what it grows, what it answers, and to whom it pushes."""
 
 import math
 import random
@@ -35,7 +35,7 @@ def ready() -> World:
     return world
 
 
-def test_before_the_target_is_known_nothing_is_grown_and_requests_are_answered_no_target(world: World) -> None:
+def test_before_the_target_is_known_nothing_is_grown_or_answered(world: World) -> None:
     world.mark(5)
     world.watch.on_pose(pose(5, target="t1"), world.now_ns)
     assert world.tick() == []
@@ -89,7 +89,7 @@ def test_changes_wait_as_long_as_repairs_have_had_their_share_and_no_route_passe
         assert len(ready.tree.named("update")) == before + 1
 
 
-def test_a_full_growth_is_handed_to_the_worker_with_its_version_and_its_tree_is_adopted_and_served(world) -> None:
+def test_the_tree_of_a_growth_that_a_worker_is_handed_is_adopted_and_served(world) -> None:
     world.pose(10, 20)
     world.mark(5)
     world.tree.answers = [Update("none", wants_full=True)]
@@ -167,7 +167,7 @@ def test_whatever_happens_the_tree_ends_up_with_the_newest_pose_and_map(chance: 
     assert world.map.take_dirty() == []
 
 
-def test_a_mark_is_timed_from_its_stamp_to_the_tree_that_knows_it_be_it_grown_by_a_worker(ready: World) -> None:
+def test_a_mark_is_timed_from_its_stamp_to_the_tree_that_knows_it(ready: World) -> None:
     ready.mark(5, stamp_ns=ready.now_ns - 20_000_000)
     ready.tick()
     assert ready.counters.histograms["mark_to_tree_ms"].quantile(1.0) == pytest.approx(120, rel=0.05)
@@ -225,7 +225,7 @@ def test_too_wide_a_gap_asks_for_one_full_growth_a_second(ready: World) -> None:
 
 
 @pytest.mark.parametrize("repair_ms", [0, 45])
-def test_growths_are_timed_by_the_stopwatch_that_is_handed_in_without_the_repair_before_them(
+def test_growths_are_timed_by_the_stopwatch_without_the_repair_before_them(
     repair_ms: int,
 ) -> None:
     times = iter([10_000_000, 60_000_000])
@@ -257,7 +257,7 @@ def test_the_status_is_told_twice_a_second(ready: World) -> None:
     )
 
 
-# --- what it answers, and to whom it pushes routes ---------------------------------------------------------------
+# --- what it answers, and to whom it pushes routes ---
 
 
 def test_a_person_asks_by_row_and_col(ready: World) -> None:

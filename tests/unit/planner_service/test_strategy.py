@@ -209,7 +209,7 @@ def test_auto_takes_the_cheaper_of_a_growth_to_the_askers_and_an_exact_move_and_
 
 
 def large_tree(clock: Iterator[int] | None = None) -> tuple[TargetTree, np.ndarray, GridSpec]:
-    """An exact tree in pieces of a map which only a worker may grow again, and the paces that it was given."""
+    """An exact tree in pieces that only a worker may grow again, and the paces that it was given."""
     grid = GridSpec(512, 512, 1.0)
     stopwatch = (lambda: 0) if clock is None else clock.__next__
     tree = TargetTree(grid, PlannerConfig(cpu_budget=0.1), has_worker=True, stopwatch=stopwatch)

@@ -58,7 +58,7 @@ def here() -> Watch:
     ("place", "named"),
     [({"cell": GRID.cells}, "cell 600"), ({"cell": CELL_OF_PLACE, "x_m": 1234.5, "y_m": 0.0}, "1234, 0 m")],
 )
-def test_a_pose_outside_is_counted_said_once_and_not_used(here: Watch, place: dict[str, Any], named: str) -> None:
+def test_a_pose_outside_is_counted_said_once_and_not_used(here, place, named):
     here.hear()
     for _ in range(5):
         here.hear(**place)

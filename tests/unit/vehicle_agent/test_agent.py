@@ -73,7 +73,7 @@ def test_at_the_start_all_planners_are_asked_once_for_all_vehicles(agent: Agent)
     assert agent.decide(S // 10) == []
 
 
-def test_one_request_per_target_and_tick_for_all_who_need_a_route_and_those_whom_it_leaves_out_ask_again(agent):
+def test_one_request_per_target_and_tick_for_all_who_need_a_route(agent):
     (asked,) = agent.decide(0)
     assert isinstance(asked, AskCosts)
     answer_costs(agent, asked, 0, t0=[5.0, 6.0], t1=[math.inf, math.inf])

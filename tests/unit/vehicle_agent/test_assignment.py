@@ -1,4 +1,4 @@
-"""The target of each vehicle of an agent: even shares, pursuers of a whole group first, and when it asks again."""
+"""The target of each vehicle of an agent: even shares, or pursuers of a group first; when it asks."""
 
 import math
 from dataclasses import replace
@@ -44,7 +44,7 @@ PERIOD_NS = int(PERIOD_S * NS_PER_S)
 
 @st.composite
 def problems(draw: st.DrawFn) -> Problem:
-    """Costs of up to five targets and twelve vehicles, of which some may be out of reach; what each chases now."""
+    """Costs of some targets, of which not all may be in reach, and what each vehicle chases now."""
     targets, vehicles = draw(st.integers(1, 5)), draw(st.integers(1, 12))
     finite = st.integers(1, 40).map(float) | st.sampled_from([1.0, 2.0, 50.0, 51.0])
     cost = finite | st.just(math.inf) if draw(st.booleans()) else finite
@@ -73,7 +73,7 @@ def plugged(made: object, told: list[str]) -> Assigner:
     return assigner_of(plugin, AssignmentWorld("a0", "all", (), 1), told.append)
 
 
-# --- even shares ------------------------------------------------------------------------------------------------
+# --- even shares ---
 
 
 @given(problems())
@@ -174,7 +174,7 @@ def test_whatever_a_plugin_assigns_vehicles_go_only_where_they_have_a_route(worl
         assert chosen.tolist() == answer
 
 
-# --- pursuers first ------------------------------------------------------------------------------------------
+# --- pursuers first ---
 
 
 def shares_of(costs_s: Costs, pursuers: int) -> int:
@@ -228,7 +228,7 @@ def test_costs_beyond_all_bounds_leave_the_differences_of_the_others() -> None:
     assert need_first(costs_s, [-1, -1, -1], 1).tolist() == [-1, 0, 1]
 
 
-# --- agents of a group ------------------------------------------------------------------------------------------
+# --- agents of a group ---
 
 
 def table_of(costs_s: Costs, current: list[int], rows: list[int], columns: list[int]) -> CostTable:
@@ -405,7 +405,7 @@ def test_hostile_costs_are_refused_by_the_codec(changes: dict[str, object], foun
         decode(raw, SharedCosts)
 
 
-# --- how often it is asked ---------------------------------------------------------------------------------------
+# --- how often it is asked ---
 
 SOON_S, TICK_S = 0.5, 0.1
 TICKS = 300

@@ -38,9 +38,7 @@ def test_a_vehicle_tells_the_end_of_its_path_where_a_new_route_for_it_begins() -
         (("v", "t1", (6,)), {"t0": {}, "t1": {"v": 6}}, {}),  # an empty target is told once
     ],
 )
-def test_who_has_driven_past_the_cell_told_or_left_its_target_is_told_again_before_the_heartbeat(
-    now, at_once, later
-):
+def test_who_drives_past_the_cell_told_or_leaves_its_target_is_told_at_once(now, at_once, later):
     report = ChasersReport("a0.1")
     told(report, ("v", "t0", (4, 5, 6)))
     assert told(report, now, at_ns=TICK_NS) == at_once

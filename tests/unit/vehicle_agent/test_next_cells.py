@@ -224,7 +224,7 @@ def test_one_that_obstacles_leave_no_step_is_shut_in_until_one_of_them_moves() -
             assert steering.shut_in == expected[tenth]
 
 
-# --- what a change of the map concerns ----------------------------------------------------------------------
+# --- what a change of the map concerns ---
 
 numbers = st.integers(-4, 20)
 sizes = st.just((-1, -1)) | st.tuples(st.integers(0, 9), st.integers(0, 9))

@@ -266,7 +266,7 @@ def test_a_vehicle_at_rest_makes_way_for_an_obstacle_that_comes(obstacles: Obsta
     assert wish_at(GRID.cell(25, 13)).better == 0
 
 
-# --- targets as obstacles -----------------------------------------------------------------------------------
+# --- targets as obstacles ---
 
 TEXT = """
 targets = [{{ name = "t", obstacle_radius_m = {radius} }}, {{ name = "soft" }}]
@@ -285,7 +285,7 @@ def made() -> TargetObstacles:
     return TargetObstacles(parse_scenario(TEXT.format(radius=2)), GRID)
 
 
-def test_a_target_closes_its_cell_and_those_that_it_drives_to(made: TargetObstacles, obstacles: Obstacles) -> None:
+def test_a_target_closes_its_cell_and_those_that_it_drives_to(made, obstacles):
     for number, col in enumerate((3.5, 4.5)):
         (obstacle,) = made.obstacles_of(pose(col), NOW + number * NS_PER_S // 2)
         obstacles.take_report(obstacle, NOW)

@@ -32,7 +32,7 @@ def changed(cells: dict[int, float]) -> NDArray[np.float32]:
         (8, 10.0, [7, 8, 16, 17]),  # nothing outside the grid
     ],
 )
-def test_all_cells_within_the_radius_are_seen_once_and_no_others(at: int, range_m: float, seen: list[int]) -> None:
+def test_all_cells_within_the_radius_are_seen_once_and_no_others(at, range_m, seen):
     assert sorted(TruthSensor(GRID, LEVEL, range_m).look([at]).cells.tolist()) == seen
 
 
