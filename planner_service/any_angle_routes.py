@@ -2,28 +2,22 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from planner_service.kernels.decorators import load
+from planner_service.kernels.layout import step_offsets
+from planner_service.kernels.route_kernels import ALL_CORNERS, NO_CORNERS, OPEN_CORNERS, pull_routes
 from shared_map.array_files import Floats
 from shared_map.terrain.slope_and_climb import Climb, may_be_pulled
 from swarm.config.scenario import PlannerConfig
 from swarm.wire.route_columns import RouteBatch
 
-
-@dataclass(frozen=True, slots=True, eq=False)
-class Pulled:
-    """Routes along the cells that their segments cross.
-
-    directions  uint8   of all routes, one after the other; ends: int64 (n,), where each stops in it
-    legs        uint32  over how many steps each segment goes
-    """
-
-    directions: NDArray[np.uint8]
-    ends: NDArray[np.int64]
-    legs: NDArray[np.uint32]
+Pulled = tuple[NDArray[np.uint8], NDArray[np.int64], NDArray[np.uint32]]
+"""Routes along the cells that their segments cross: (directions of all, one route after the other; where each stops
+in them; over how many steps each segment goes)."""
 
 
 def pulls(config: PlannerConfig, climb: Climb | None) -> bool:
@@ -43,18 +37,13 @@ class Puller:
     def __init__(
         self, pace: Floats, resolution_m: float, config: PlannerConfig, climb: Climb | None = None
     ) -> None:
-        # Compiled only for planners of any-angle routes: no other process waits for it at a first start.
-        from planner_service.kernels.decorators import load
-        from planner_service.kernels.layout import step_offsets
-        from planner_service.kernels.route_kernels import ALL_CORNERS, NO_CORNERS, OPEN_CORNERS, pull_routes
-
         self._metres = resolution_m
         self._pace, self._offsets = pace.reshape(-1), step_offsets(pace.shape[1])
         self._corners = ALL_CORNERS if config.corner_cutting else OPEN_CORNERS
         if config.neighbours == 4:
             self._corners = NO_CORNERS
-        self._kernel = pull_routes
         self._flight = None if climb is None else _flight(climb)
+        # Compiled only for planners of any-angle routes: no other process waits for it at a first start.
         load(pull_routes.alike if climb is None else pull_routes.directed)
 
     def pull(
@@ -77,11 +66,11 @@ class Puller:
         legs, turned = np.empty(2 * steps, np.uint32), np.empty(1, np.int64)
         ground, prices = (self._pace, self._flight, self._offsets, self._corners), np.empty((3, many))
         while True:
-            self._kernel(*ground, (*given, stays), scratch, (*out, legs, turned), prices)
+            pull_routes(*ground, (*given, stays), scratch, (*out, legs, turned), prices)
             done = int(out[1][-1]) if many else 0
             returns = self._returns(starts, out[0][:done], out[1]) & ~stays
             if not returns.any():
-                return Pulled(out[0][:done], out[1], legs[: turned[0]]), prices * self._metres
+                return (out[0][:done], out[1], legs[: turned[0]]), prices * self._metres
             stays |= returns
 
     def _returns(
@@ -102,12 +91,9 @@ class Puller:
         """The same routes along their segments. Costs and bounds stay those of the routes over neighbours."""
         if not routes.directions.size:
             return routes
-        pulled, prices = self.pull(routes.starts, routes.directions, routes.ends)
+        (directions, ends, legs), prices = self.pull(routes.starts, routes.directions, routes.ends)
         length_m = np.where(np.isfinite(prices[0]), prices[2], routes.length_m)
-        return replace(
-            routes,
-            directions=pulled.directions, ends=pulled.ends, legs=pulled.legs, length_m=length_m
-        )  # fmt: skip
+        return replace(routes, directions=directions, ends=ends, legs=legs, length_m=length_m)
 
 
 def _flight(climb: Climb) -> tuple[Floats, Floats, Floats, tuple[float, float]]:

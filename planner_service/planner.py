@@ -94,10 +94,10 @@ class Planner:
         counters: Counters,
         *,
         route_cells: int = 0,
+        target_search: TargetSearch,
         stopwatch: Callable[[], int] | None = None,
         newest_mark_ns: Callable[[], int | None] = lambda: None,
         leads: bool = True,
-        target_search: TargetSearch | None = None,
         vehicle_class: str = GROUND,
     ) -> None:
         self.target = watch.target
@@ -141,11 +141,9 @@ class Planner:
         self._puller = Puller(pace, resolution_m, config, climb) if pulls(config, climb) else None
         self._status_due_ns = 0
         self.target_search = target_search
-        """None if the target is never searched for."""
         self._ways = Ways(tree.cost_grid)
         """Routes of this class's vehicles to search places."""
-        is_hidden = target_search is not None and not target_search.tracked
-        for name in COUNTS + SEARCH_COUNTS if is_hidden else COUNTS:
+        for name in COUNTS if target_search.tracked else COUNTS + SEARCH_COUNTS:
             counters.count(name, 0)
 
     def lead(self, leads: bool) -> None:
@@ -198,7 +196,7 @@ class Planner:
         self.followers.drop_silent(now_ns)
         if self.leads:
             actions.extend(self._pushes(now_ns))
-            if self.target_search is not None and self.vehicle_class == GROUND:
+            if self.vehicle_class == GROUND:
                 believed = self.target_search.belief_message(self.target, self._incarnation, now_ns)
                 actions.extend([] if believed is None else [believed])
         if self.leads and now_ns >= self._status_due_ns:
@@ -253,7 +251,7 @@ class Planner:
         """Takes in the newest pose and all map changes since the last time, if there are any."""
         pose = self._watch.pose
         if pose is None:
-            if self._under_way is not None and self.tree.map_version != self._cost_map.version:
+            if self.target_search.active and self.tree.map_version != self._cost_map.version:
                 self._learn_map(now_ns)
             return []  # the first growth takes the map as it is then, whatever changed before
         now_known = (pose.cell, self._cost_map.version)
@@ -265,16 +263,9 @@ class Planner:
             return [self._grow(now_ns)]
         return []
 
-    @property
-    def _under_way(self) -> TargetSearch | None:
-        """The search for the target, while it is unseen."""
-        return self.target_search if self.target_search is not None and self.target_search.active else None
-
     def _search(self, now_ns: int) -> None:
         """Searches for the target while it is unseen."""
         search = self.target_search
-        if search is None:
-            return
         if self.tree.map_version < 0 and not search.tracked:
             self._learn_map(now_ns)
         if self.vehicle_class != GROUND:
@@ -367,7 +358,8 @@ class Planner:
         cells = self._cells(request)
         most = (MOST_STEPS if self._puller is None else MOST_PULLED_STEPS) // max(len(cells), 1)
         max_cells = min(request.max_cells or most, most) if most < self._grid.cells else request.max_cells
-        if (search := self._under_way) is not None:
+        search = self.target_search
+        if searching := search.active:
             ways, vehicles = self._ways, request.vehicles
             routes = self._on_current_map(
                 lambda: search.routes(ways, cells, vehicles, max_cells, self.tree.map_version), now_ns
@@ -381,7 +373,7 @@ class Planner:
             rows=self._grid.rows, cols=self._grid.cols, routes=given.columns(), **self._reply_fields(now_ns)
         )
         send(reply)
-        if search is None:
+        if not searching:
             self._certify(routes, now_ns)
         self.counters.count("routes_served", len(given))
         for vehicle, route in zip(request.vehicles, given, strict=False):  # a person's comes last, of no vehicle
@@ -402,7 +394,7 @@ class Planner:
             return routes
         if self._taken_in is not None and self.tree.ready:
             self._take_in((self._taken_in[0], self._cost_map.version), now_ns)
-        elif self._under_way is not None:
+        elif self.target_search.active:
             self._learn_map(now_ns)
         else:
             return routes
@@ -448,9 +440,9 @@ class Planner:
         if self.tree.ready and self.tree.may_reach(cells, costs_s):
             return Refusal("the tree still grows towards some of these cells: ask again")
         self.counters.count("costs_served", len(cells))
-        if (search := self._under_way) is not None:
+        if self.target_search.active:
             on_map = [0 <= cell < self._grid.cells and self.tree.cost_grid.passable(cell) for cell in cells]
-            costs_s = search.costs_s(costs_s, np.array(on_map, np.bool_))
+            costs_s = self.target_search.costs_s(costs_s, np.array(on_map, np.bool_))
         return planning.CostReply(cost_to_go_s=pack_column(costs_s, "<f4"), **self._reply_fields(now_ns))
 
     def _fields(self, now_ns: int) -> dict[str, Any]:
@@ -480,8 +472,8 @@ class Planner:
 
     def _pushes(self, now_ns: int) -> list[Action]:
         """Newer routes for followers which a change concerns and which have not had one for a while."""
-        if (search := self._under_way) is not None:
-            return self._places_to_push(search.searcher, now_ns)
+        if self.target_search.active:
+            return self._places_to_push(self.target_search.searcher, now_ns)
         target_cell = self.tree.target_cell
         if not self.tree.ready or target_cell is None:
             return []

@@ -69,7 +69,7 @@ class PreparedCosts:
             found = _read(path, cost_grid.size)
             if found is None:
                 cost_grid.load(private_copy(terrain.pace_s_per_m))  # kernels know arrays that may be written only
-                _save(path, cost_grid.time_cost)
+                save_array(path, np.concatenate((cost_grid.time_cost, _digest_of(cost_grid.time_cost))))
                 found = open_array(path)[: cost_grid.size]
         self.cell_cost: Floats = found
 
@@ -96,23 +96,15 @@ def _digest_of(array: NDArray[Any]) -> NDArray[Any]:
     return np.frombuffer(hashlib.blake2b(array.data, digest_size=_DIGEST_BYTES).digest(), array.dtype)
 
 
-def _save(path: Path, array: NDArray[Any]) -> None:
-    """Writes an array with its digest, where `_read` reads it."""
-    save_array(path, np.concatenate((array, _digest_of(array))))
-
-
 def _read(path: Path, size: int) -> Floats | None:
-    """None if the file is missing; a damaged one counts as missing, and is logged: kernels check no index that they
-    read from it."""
+    """The array before its digest. None if the file is missing; a damaged one counts as missing, and is logged:
+    kernels check no index that they read from it."""
     try:
         whole = open_array(path)
-        if whole.ndim != 1 or whole.dtype != np.float32:
+        if whole.dtype != np.float32 or whole.shape != (size + _DIGEST_BYTES // whole.itemsize,):
             raise ValueError(f"it is {whole.shape} {whole.dtype}")
-        digest_size = _DIGEST_BYTES // whole.itemsize
-        found, digest = whole[:-digest_size], whole[-digest_size:]
-        if found.size != size:
-            raise ValueError(f"it has {found.size} values")
-        if digest.tobytes() != _digest_of(found).tobytes():
+        found = whole[:size]
+        if whole[size:].tobytes() != _digest_of(found).tobytes():
             raise ValueError("its digest is another")
     except FileNotFoundError:
         return None

@@ -28,7 +28,7 @@ from shared_map.array_files import Bools, Floats
 from swarm.clock import NS_PER_S
 from swarm.config.scenario import Scenario, ids_of
 from swarm.config.vehicle_classes import least_sense_range_m
-from swarm.grid import GridSpec, walk
+from swarm.grid import walk
 from swarm.wire.fields import pack_column
 from swarm.wire.messages.planning import MOST_BELIEVED, Believed, Sighted, TargetPose
 from swarm.wire.route_columns import LETHAL_START, OUTSIDE, SEARCHING, UNREACHABLE, Route, RouteBatch, RouteStatus
@@ -76,16 +76,12 @@ class Ways:
     first."""
 
     def __init__(self, costs: CostGrid) -> None:
-        self.costs = costs
+        self.costs, self.grid = costs, costs.grid
         self._cost: Floats = np.empty(0, np.float32)
         self._parent: NDArray[np.uint8] = np.empty(0, np.uint8)
         self._root = -1
         self._back_climbs: Climbs | None = None
         """Climbs of the way back. None before they are asked for."""
-
-    @property
-    def grid(self) -> GridSpec:
-        return self.costs.grid
 
     def grow(self, cell: int) -> None:
         """Finds the cheapest ways from a passable cell to all others."""
@@ -458,6 +454,8 @@ class TargetSearch:
     def __init__(self, hidden: Hidden, costs: CostGrid, time_scale: float) -> None:
         self.searcher = Searcher(Ways(costs), hidden.sense_range_m, hidden.slowness, hidden.seed)
         self.time_scale = time_scale
+        self.tracked = hidden.tracked
+        """True if the target has a tracker, living or not."""
         self.searches = 0
         """Number of searches begun."""
         self._hidden, self._grid = hidden, costs.grid
@@ -473,11 +471,6 @@ class TargetSearch:
         """True if the last message was about a search under way."""
         self._searched: TargetPose | None = None
         """The newest pose when the search began."""
-
-    @property
-    def tracked(self) -> bool:
-        """True if the target has a tracker, living or not."""
-        return self._hidden.tracked
 
     @property
     def active(self) -> bool:

@@ -148,10 +148,10 @@ class TargetTree:
         self._all_kernels = all_kernels
         self._has_worker = has_worker
         self._stopwatch = stopwatch
-        # The last known cell costs of the map, and whether there are any.
-        self._costs = CostGrid(grid, config, climb)
+        # The last known cell costs of the map, whose owner is this tree, and whether there are any.
+        self.cost_grid = CostGrid(grid, config, climb)
         self._loaded = False
-        self._tree: partitioned_tree.AnyTree = CostToGoTree(self._costs)
+        self._tree: partitioned_tree.AnyTree = CostToGoTree(self.cost_grid)
         self._state = State.STALE
         # A worker has a `full_job` that was not adopted yet: no second one is asked for.
         self._job_out = False
@@ -161,9 +161,9 @@ class TargetTree:
         self.times = GrowthTimes(grid, config, has_worker, climb is not None, chosen_by)
         self._windows = WindowSchedule(grid, config, self.times)
         # Knows the last exact costs and every change since: certificates while the tree is not exact.
-        self._bounds = LowerBounds(self._costs)
+        self._bounds = LowerBounds(self.cost_grid)
         # Growths that stop, and the askers, which decide how far they go. Some were too far for a growth here.
-        self._growth = PartialGrowth(self._costs)
+        self._growth = PartialGrowth(self.cost_grid)
         self._askers = Askers()
         self._too_far = False
         # The tree became exact on this thread: before it is no longer, its costs are to be taken for bounds.
@@ -175,11 +175,6 @@ class TargetTree:
         return self.target_cell is not None
 
     @property
-    def cost_grid(self) -> CostGrid:
-        """The last known cell costs of the map; its owner is this tree."""
-        return self._costs
-
-    @property
     def strategy(self) -> StrategyRow:
         """The row in force now; it changes with `observe_full_ns`, as under `auto`."""
         row = self.times.row
@@ -188,7 +183,7 @@ class TargetTree:
     def share(self, cell_cost: Floats) -> None:
         """Begins with the cell costs of the map before any mark, which other processes share; `update` receives all
         changes since. Before the first `update`."""
-        self._costs.share(cell_cost)
+        self.cost_grid.share(cell_cost)
         self._loaded = True
 
     # --- keeping up ---------------------------------------------------------------------------------------------
@@ -216,7 +211,7 @@ class TargetTree:
         offered = self._tree.parent.copy() if leads_there else None
         self._job_out = True
         return partitioned_tree.growth_job(
-            self._costs.snapshot(), target_cell, self.map_version, offered, self._in_pieces
+            self.cost_grid.snapshot(), target_cell, self.map_version, offered, self._in_pieces
         )
 
     @property
@@ -233,7 +228,7 @@ class TargetTree:
         """Returns the search for this tree's stride network, for a worker: marks make its result less good, never
         wrong."""
         self._seeks_network = True
-        return partial(find_strides, self._costs.snapshot())
+        return partial(find_strides, self.cost_grid.snapshot())
 
     def take_strides(self, found: StrideNetwork) -> None:
         """Uses a stride network from now on, as `stride_job` found it."""
@@ -258,14 +253,14 @@ class TargetTree:
         changes = self._learn(pace, dirty)
         self.map_version = map_version
         if grown.offered is not None:
-            self.last_gaps = partitioned_tree.offered_gaps(self._costs, grown, self._inside(followed_cells))
+            self.last_gaps = partitioned_tree.offered_gaps(self.cost_grid, grown, self._inside(followed_cells))
         if not self._set_target(target_cell, changes):
             return Update("none")
-        since = self._costs.changes_since(grown.cell_cost)
+        since = self.cost_grid.changes_since(grown.cell_cost)
         if grown.reach < 0:  # then the target had left the grid, or stood on a lethal cell
             return self._follow(target_cell, changes)
         in_pieces = self._in_pieces or not self.times.is_quick(self._grid.cells)  # as it is, if that takes long
-        self._tree = grown.tree_on(self._costs, in_pieces)
+        self._tree = grown.tree_on(self.cost_grid, in_pieces)
         self._windows.note_whole(grown.target_cell)
         self._is_better_bound = grown.heuristic is None
         if grown.heuristic is None:
@@ -307,7 +302,7 @@ class TargetTree:
         if not self._is_whole:
             unknown = routes.statuses == UNREACHABLE
             routes.statuses[unknown] = NO_TARGET
-            routes.lower_bound_s[unknown] = self._tree.bound * self._costs.time_share
+            routes.lower_bound_s[unknown] = self._tree.bound * self.cost_grid.time_share
         return routes
 
     def cost_to_go_at(self, cells: Any) -> Floats:
@@ -317,7 +312,7 @@ class TargetTree:
         if self.ready:
             inside = (asked >= 0) & (asked < self._grid.cells)
             self._reach(asked)
-            starts = self._costs.pad_all(asked[inside])
+            starts = self.cost_grid.pad_all(asked[inside])
             costs[inside] = self._tree.cost_at(starts)
         return costs
 
@@ -331,10 +326,10 @@ class TargetTree:
     def _learn(self, pace: Floats, dirty: Sequence[Window]) -> Changes | None:
         """Takes the map's changes. None the first time: everything is new."""
         if not self._loaded:
-            self._costs.load(pace)
+            self.cost_grid.load(pace)
             self._loaded = True
             return None
-        changes = self._costs.apply(pace, dirty)
+        changes = self.cost_grid.apply(pace, dirty)
         self._growth.learn(changes)
         if changes.any_lower:
             self._tree.window_bound = None
@@ -350,7 +345,7 @@ class TargetTree:
     def _set_target(self, target_cell: int, changes: Changes | None) -> bool:
         """Returns True if the target is on a cell to which a tree can lead. If not, the tree is stale as soon as
         the map changes."""
-        self.target_cell = target_cell if partitioned_tree.can_be_root(self._costs, target_cell) else None
+        self.target_cell = target_cell if partitioned_tree.can_be_root(self.cost_grid, target_cell) else None
         changed = changes is None or bool(changes.cells.size)
         if self.ready or not 0 <= target_cell < self._grid.cells:
             self.lethal_target = None
@@ -370,14 +365,14 @@ class TargetTree:
         row, col = self._grid.row_col(target_cell)
         last = None if self.lethal_target is None else self.lethal_target.nearest
         first = 1 if last is None else self._grid.distance_cells(target_cell, last) * 3 // 2 + 1
-        costs = self._costs.cell_cost.reshape(-1, self._costs.stride)[1:-1, 1:-1]
+        costs = self.cost_grid.cell_cost.reshape(-1, self.cost_grid.stride)[1:-1, 1:-1]
         for half in (*(first << n for n in range(8) if first << n < _NEAR_CELLS), _NEAR_CELLS):
             window = self._grid.around(target_cell, half)
             rows, cols = np.nonzero(costs[window.row0 : window.row1, window.col0 : window.col1] < np.inf)
             rows, cols = rows + window.row0, cols + window.col0
             away = (rows - row) ** 2 + (cols - col) ** 2
             near = np.flatnonzero((away <= half**2) | (half == _NEAR_CELLS))
-            led = near[self._leads((rows[near] + 1) * self._costs.stride + cols[near] + 1)]
+            led = near[self._leads((rows[near] + 1) * self.cost_grid.stride + cols[near] + 1)]
             chosen = led if led.size or half < _NEAR_CELLS else near
             if chosen.size:
                 best = int(chosen[away[chosen].argmin()])
@@ -480,7 +475,9 @@ class TargetTree:
             return Update("none", wants_full=not self._job_out)
         if isinstance(self._tree, partitioned_tree.PartitionedTree) is not self._in_pieces:
             self._tree = (
-                partitioned_tree.PartitionedTree(self._costs) if self._in_pieces else CostToGoTree(self._costs)
+                partitioned_tree.PartitionedTree(self.cost_grid)
+                if self._in_pieces
+                else CostToGoTree(self.cost_grid)
             )
         self._tree.grow(target_cell)
         self._state = State.CURRENT
@@ -522,7 +519,7 @@ class TargetTree:
 
         rest  the worker is to grow the whole tree
         """
-        root, askers = self._costs.pad(target_cell), self._passable(self._askers.cells)
+        root, askers = self.cost_grid.pad(target_cell), self._passable(self._askers.cells)
         aim = self._growth.aim_at(askers, root)
         self._growth.begin(root)
         grown = self._growth.go_on(askers, self.times.most_cells, aim)
@@ -537,7 +534,7 @@ class TargetTree:
 
     def _take_grown(self, target_cell: int) -> None:
         if not isinstance(self._tree, CostToGoTree):
-            self._tree = CostToGoTree(self._costs)
+            self._tree = CostToGoTree(self.cost_grid)
         self._tree.take_grown(target_cell, self._growth)
 
     def knows(self, cells: Any) -> bool:
@@ -572,8 +569,8 @@ class TargetTree:
         """Notes padded cells that asked, and how far a growth must go for them."""
         if not starts.size:
             return
-        row, col = divmod(self._costs.pad(self._tree.root), self._costs.stride)
-        row0, col0, row1, col1 = box_of(starts.astype(np.uint32), self._costs.stride)
+        row, col = divmod(self.cost_grid.pad(self._tree.root), self.cost_grid.stride)
+        row0, col0, row1, col1 = box_of(starts.astype(np.uint32), self.cost_grid.stride)
         half = max(row - row0, row1 - 1 - row, col - col0, col1 - 1 - col)
         if (self._is_whole or self._too_far) and self._without_path(starts).size:
             half = self._grid.cells
@@ -584,7 +581,9 @@ class TargetTree:
         if not self._is_whole:
             return self._growth.cost[starts] < np.inf
         root = self._tree.root
-        return (self._tree.parent[starts] != NONE) | (starts == self._costs.pad(root)) if root >= 0 else starts < 0
+        return (
+            (self._tree.parent[starts] != NONE) | (starts == self.cost_grid.pad(root)) if root >= 0 else starts < 0
+        )
 
     def _without_path(self, starts: NDArray[np.int64]) -> NDArray[np.int64]:
         """Those of some padded cells from which the tree leads nowhere, or not yet."""
@@ -592,17 +591,17 @@ class TargetTree:
 
     def _open(self, cells: Any) -> NDArray[np.int64]:
         """Those of some numbers that are passable cells of the grid, padded."""
-        return self._passable(self._costs.pad_all(self._inside(cells)))
+        return self._passable(self.cost_grid.pad_all(self._inside(cells)))
 
     def _passable(self, starts: NDArray[np.int64]) -> NDArray[np.int64]:
-        return starts[self._costs.cell_cost[starts] < np.inf]
+        return starts[self.cost_grid.cell_cost[starts] < np.inf]
 
     def _force_near(self, wanted: NDArray[np.int64]) -> Update | None:
         """Makes the tree exact as far as these cells are; None if that takes too long here."""
         tree, growth = self._tree, self._growth
         if not (isinstance(tree, CostToGoTree) and growth.usable and tree.precise and self._all_kernels()):
             return None
-        growth.begin(self._costs.pad(tree.root))
+        growth.begin(self.cost_grid.pad(tree.root))
         starts = self._open(wanted)
         grown = growth.go_on(starts, self.times.most_cells)
         if grown < 0 or (growth.bound < np.inf and not (growth.cost[starts] < np.inf).all()):
@@ -625,7 +624,7 @@ class TargetTree:
         if changes.cells.size == 0:
             return Update("none")
         tree = self._tree
-        if not tree.fine or not self._costs.cell_cost[self._costs.pad(tree.root)] < np.inf:
+        if not tree.fine or not self.cost_grid.cell_cost[self.cost_grid.pad(tree.root)] < np.inf:
             return None
         if not self._all_kernels():
             return None
@@ -633,7 +632,7 @@ class TargetTree:
         visited = tree.repair(changes)
         if visited < 0 or not tree.fine:
             return None
-        window, took_ns = self._costs.window_of(changes.cells), self._stopwatch() - began_ns
+        window, took_ns = self.cost_grid.window_of(changes.cells), self._stopwatch() - began_ns
         return Update("repair", window, visited, repair_ns=took_ns)
 
     @property

@@ -60,7 +60,7 @@ def turned_round(climbs: Climbs) -> Climbs:
 
 
 @helper
-def _entry(rise, scale, half):
+def entry_of(rise, scale, half):
     """int32: which entry of a table a rise (m) has."""
     at = rise * scale
     at = at if at == at else _LEVEL
@@ -83,7 +83,7 @@ def is_windy(climbs):
 def step_price(climbs, v, u, way):
     """Returns the cost of the step from v into its neighbour u, in direction `way`, in cell costs of u."""
     height, prices, scale, begins = climbs[0], climbs[1], climbs[2], climbs[3]
-    entry = _entry(height[u] - height[v], scale[way & 1], _half_of(begins))
+    entry = entry_of(height[u] - height[v], scale[way & 1], _half_of(begins))
     return prices[np.uint64(begins[way] + entry)]
 
 
@@ -105,7 +105,7 @@ def find_entries(rises, first, n, climbs, way, entries):
     vectorises."""
     length, half, begin = climbs[2][way & 1], _half_of(climbs[3]), climbs[3][way]
     for i in range(n):
-        entries[first + i] = begin + _entry(rises[first + i], length, half)
+        entries[first + i] = begin + entry_of(rises[first + i], length, half)
 
 
 @helper
@@ -119,7 +119,7 @@ def offers_of_row(cell_cost, cost, climbs, way, first, n, o):
     length, half, begin = scale[way & 1], _half_of(begins), begins[way]
     for i in range(n):
         v = first + i
-        entries[i] = begin + _entry(height[v + o] - height[v], length, half)
+        entries[i] = begin + entry_of(height[v + o] - height[v], length, half)
     for i in range(n):
         keys[i] = prices[np.uint64(entries[i])]
     for i in range(n):

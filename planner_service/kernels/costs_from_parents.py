@@ -25,9 +25,9 @@ from planner_service.kernels.decorators import helper, prefetch, step_kernel
 from planner_service.kernels.layout import BUCKETS, GRID, LABELS, NONE, RULE_OCTILE, SQRT2, step_offsets
 from planner_service.kernels.repair import (
     ANY_COST,
-    FINE_ROW,
     SCRATCH,
     clear_rows,
+    note,
     point_near,
     row_factor,
     spread,
@@ -125,7 +125,6 @@ def _lower_branches(grid, climbs, cost, walk, queue, count, rows):
     that in `rows`. A cell that hangs on two of them may be lowered twice. Returns how many times one was, or -1
     beyond the queue's room."""
     cell_cost, _, stride, _, _ = grid
-    first, last = rows
     per_row = row_factor(stride)
     children, steps, lengths, ways, many = walk
     n, i = np.uint64(count), np.uint64(0)
@@ -133,9 +132,7 @@ def _lower_branches(grid, climbs, cost, walk, queue, count, rows):
     while i < n and n < room:
         u = np.uint64(queue[i])
         i += _ONE
-        row = np.int64(u * per_row >> FINE_ROW)
-        first[row] = min(first[row], np.int64(u))
-        last[row] = max(last[row], np.int64(u))
+        note(rows, per_row, u)
         key, own = cost[u], cell_cost[u]
         bits, at = np.uint64(children[u]), np.int64(u)
         for j in range(np.uint64(many[bits])):

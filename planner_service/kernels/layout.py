@@ -100,10 +100,23 @@ def step_length(rule, odd):
 
 
 @helper
-def cuts_corner(v, way, x, offsets):
-    """Returns True if the step from padded cell `v` in direction `way` is a diagonal one that passes beside cell
-    `x`."""
-    return way & 1 == 1 and (v + offsets[way - 1] == x or v + offsets[(way + 1) & 7] == x)
+def leads_by(parent, offsets, x, k, past):
+    """Returns True if the neighbour of padded cell `x` in direction `k` has x for its parent or, if `past`, one
+    beyond a corner of x."""
+    v = x + offsets[k]
+    way = parent[v]
+    if way == NONE:
+        return False
+    beside = way & 1 == 1 and (v + offsets[way - 1] == x or v + offsets[(way + 1) & 7] == x)
+    return way == (k + 4) & 7 or (past and beside)
+
+
+@helper
+def is_shut(cell_cost, offsets, v, way):
+    """Returns True if a lethal cell lies beside the diagonal step from cell `v` in direction `way`."""
+    u = np.uint64(v)
+    one, other = u + np.uint64(offsets[way - 1]), u + np.uint64(offsets[(way + 1) & 7])
+    return not max(cell_cost[one], cell_cost[other]) < INF
 
 
 @helper

@@ -24,6 +24,7 @@ from planner_service.kernels.layout import (
     NONE,
     RULE_FOUR,
     diagonal_length,
+    is_shut,
     step_length,
 )
 
@@ -31,9 +32,13 @@ _ONE = np.uint64(1)
 
 
 @helper
-def _parents_of_eight(cell_cost, cost, s, first, last, step, limit, parent, least):
-    """A diagonal counts if the more expensive of its two corners costs at most `limit`, and none where `step`, its
-    length, is inf. Free of branches: it vectorises."""
+def least_offers(cell_cost, cost, s, first, last, step, limit, parent, least):
+    """The lowest offer to each cell, and whose it is. A diagonal counts if the more expensive of its two corners
+    costs at most `limit`, and none where `step`, its length, is inf. Free of branches: it vectorises.
+
+    parent  written; None if not needed
+    least   s; written from its first element on; None if not needed
+    """
     for i in range(first, last):
         north, east, south, west = cell_cost[i - s], cell_cost[i + _ONE], cell_cost[i + s], cell_cost[i - _ONE]
         best = cost[i - s] + north
@@ -124,7 +129,7 @@ def point_row_to_parents(grid, climbs, cost, first, last, parent, least):
         _parents_by_climb(grid, climbs, cost, begin, end, parent, least)
     else:
         limit = INF if corners else HUGE
-        _parents_of_eight(cell_cost, cost, s, begin, end, diagonal_length(rule), limit, parent, least)
+        least_offers(cell_cost, cost, s, begin, end, diagonal_length(rule), limit, parent, least)
 
 
 @step_kernel(f"({GRID}, CLIMBS, f4[::1], i8, {BOX}, u1[::1])", CLIMBS)
@@ -149,7 +154,7 @@ def _leads_on(grid, climbs, labels, v, k):
     u = v + offsets[k]
     if (odd and rule == RULE_FOUR) or not cost[u] < INF or (parent[u] == NONE and u != root):
         return False
-    if odd and not corners and max(cell_cost[v + offsets[k - 1]], cell_cost[v + offsets[(k + 1) & 7]]) == INF:
+    if odd and not corners and is_shut(cell_cost, offsets, v, k):
         return False
     return offered(cost[u], cell_cost[u], climbs, v, u, k, step_length(rule, odd)) == cost[v]
 

@@ -84,8 +84,8 @@ def _meet_inside(t, tree, tiles, scratch, fine):
     than `fine` apart."""
     piece, total = tree.piece, tree.total
     exits, many = tiles.exits, tiles.many
-    less, name, changes = scratch.less, scratch.name, scratch.changes
-    # Pieces are grouped by what their totals have changed by: `less` holds the group of each name.
+    name, changes, group_of = scratch.name, scratch.changes, scratch.queue
+    # Pieces are grouped by what their totals have changed by.
     groups = 0
     for j in range(many[t]):
         one = np.int64(exits[t * PIECES + j])
@@ -98,12 +98,12 @@ def _meet_inside(t, tree, tiles, scratch, fine):
                 return True
             changes[groups] = change
             groups += 1
-        less[one] = group
-    less[tile_pieces.NO_PIECE] = np.int32(tile_pieces.NO_PIECE)
+        group_of[one] = group
+    group_of[tile_pieces.NO_PIECE] = np.int32(tile_pieces.NO_PIECE)
     for row in range(SIDE):
         i, at = np.uint64(t * CELLS + (row << BITS)), np.uint64((row + 1) * WIDE + 1)
         for col in range(np.uint64(SIDE)):
-            name[at + col] = less[piece[i + col]]
+            name[at + col] = group_of[piece[i + col]]
     for row in range(1, SIDE + 1):
         at, s = np.uint64(row * WIDE), np.uint64(WIDE)
         other = np.uint8(0)
@@ -117,12 +117,12 @@ def _meet_inside(t, tree, tiles, scratch, fine):
 
 
 @helper
-def _meet(t, other, way, tree, schedule, fine):
+def _meet(t, other, across, tree, schedule, fine):
     """Returns True if along the border of a tile a piece's total has risen by more than that of one beside it, of
-    tile `other`, which lies `way`, this number of tiles down and to the right; by more than `fine`."""
+    tile `other`; by more than `fine`."""
     piece, total = tree.piece, tree.total
     place, sets = schedule.place, schedule.sets
-    down, right = way
+    down, right = other // across - t // across, other % across - t % across
     noted, other_noted = sets[tile_pieces.NOTED, place[t]], sets[tile_pieces.NOTED, place[other]]
     count = 1 if down and right else SIDE
     step = 1 if down else SIDE
@@ -147,16 +147,13 @@ def _any_meet(t, tree, tiles, scratch, schedule, fine):
     """Returns True if a piece of a tile has risen by more than one beside it, in the tile or about it; by more than
     `fine`."""
     falls, across = tiles.falls, tiles.across
-    row, col = t // across, t % across
-    down = falls.shape[1] // across
     if falls[1, t] > falls[0, t] + fine and _meet_inside(t, tree, tiles, scratch, fine):
         return True
-    for i in range(max(row - 1, 0), min(row + 2, down)):
-        for j in range(max(col - 1, 0), min(col + 2, across)):
-            other = i * across + j
-            if other == t or not falls[1, t] > falls[0, other] + fine:
-                continue
-            if _meet(t, other, (i - row, j - col), tree, schedule, fine):
+    row0, col0, row1, col1 = tile_pieces.rows_about(t, across, falls.shape[1])
+    for row in range(row0, row1):
+        for other in range(row * across + col0, row * across + col1):
+            apart = other != t and falls[1, t] > falls[0, other] + fine
+            if apart and _meet(t, other, across, tree, schedule, fine):
                 return True
     return False
 
@@ -166,13 +163,11 @@ def _rise(t, tiles):
     """By how much more a piece of a tile has risen than another in it or about it, s. Pending work on the tile is
     noted, too."""
     wanted, falls, ends, across = tiles.wanted, tiles.falls, tiles.ends, tiles.across
-    row, col = t // across, t % across
-    down = wanted.size // across
+    row0, col0, row1, col1 = tile_pieces.rows_about(t, across, wanted.size)
     least, near = np.inf, np.inf
     what = np.uint8(0)
-    for i in range(max(row - 1, 0), min(row + 2, down)):
-        for j in range(max(col - 1, 0), min(col + 2, across)):
-            other = i * across + j
+    for row in range(row0, row1):
+        for other in range(row * across + col0, row * across + col1):
             least = min(least, falls[0, other])
             near = min(near, ends[0, other])
             what |= wanted[other]

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 
 from planner_service.kernels.decorators import helper, kernel
 from planner_service.kernels.heap_and_buckets import QUEUE, Queue, empty, make_queue, put, take
-from planner_service.kernels.layout import GRID, INF, RULE_OCTILE, RULE_PAPER, SQRT2, WALL, diagonal_length
+from planner_service.kernels.layout import GRID, INF, RULE_OCTILE, RULE_PAPER, SQRT2, WALL, diagonal_length, is_shut
 from planner_service.kernels.queue_dial import (
     AHEAD,
     close_costs,
@@ -178,10 +178,8 @@ def _serve_again(grid, cost, era, current, touched, count, ring, most):
             key = diagonal if k & 1 else straight
             if not key < abs(old) or old == WALL:
                 continue
-            if k & 1 and not corners:
-                one, other = u + np.uint64(offsets[k - 1]), u + np.uint64(offsets[(k + 1) & 7])
-                if not max(cell_cost[one], cell_cost[other]) < INF:
-                    continue
+            if k & 1 and not corners and is_shut(cell_cost, offsets, u, k):
+                continue
             if old == INF:
                 touched[count] = v
                 count += _ONE

@@ -28,12 +28,12 @@ from numpy.typing import NDArray
 
 from planner_service.kernels.climbs import CLIMBS, offered
 from planner_service.kernels.decorators import helper, step_kernel
-from planner_service.kernels.layout import BUCKETS, GRID, INF, LABELS, NONE, cuts_corner, diagonal_length
+from planner_service.kernels.layout import BUCKETS, GRID, INF, LABELS, NONE, diagonal_length, is_shut, leads_by
 from planner_service.kernels.parents_from_costs import point_row_to_parents
 
 _NOBODY = np.int32(-1)
 _ONE = np.uint64(1)
-FINE_ROW = np.uint64(44)
+_FINE_ROW = np.uint64(44)
 """Bits of the fixed-point number by which a cell's row is found without a division."""
 _STRAIGHT = np.float32(1.0)
 _PART = np.uint64(64)
@@ -72,33 +72,24 @@ def clear_rows(rows, size):
 
 
 @helper
-def _note(first, last, stride, cells, count):
-    """Something has changed about the first `count` of these padded cells."""
-    for i in range(count):
-        row = cells[i] // stride
-        first[row] = min(first[row], cells[i])
-        last[row] = max(last[row], cells[i])
+def note(rows, per_row, cell):
+    """Something has changed about a padded cell (unsigned)."""
+    first, last = rows
+    row = np.int64(cell * per_row >> _FINE_ROW)
+    first[row] = min(first[row], np.int64(cell))
+    last[row] = max(last[row], np.int64(cell))
 
 
 @helper
-def _any_cheaper(cell_cost, changed, before):
+def _note_cheaper(rows, per_row, cell_cost, changed, before):
+    """`rows` := of the cells that got cheaper. Returns True if any has."""
+    clear_rows(rows, cell_cost.size)
     found = False
     for i in range(changed.size):
-        found |= cell_cost[changed[i]] < before[i]
+        if cell_cost[changed[i]] < before[i]:
+            note(rows, per_row, np.uint64(changed[i]))
+            found = True
     return found
-
-
-@helper
-def _note_cheaper(rows, cell_cost, stride, changed, before):
-    """`rows` := of the cells that got cheaper."""
-    clear_rows(rows, cell_cost.size)
-    first, last = rows
-    for i in range(changed.size):
-        cell = changed[i]
-        if cell_cost[cell] < before[i]:
-            row = cell // stride
-            first[row] = min(first[row], cell)
-            last[row] = max(last[row], cell)
 
 
 @helper
@@ -192,7 +183,6 @@ def spread(grid, climbs, cost, buckets, lowered, count, rows, limit, entries, he
     -2 if the queue is full (some changes are not in `rows`).
     """
     cell_cost, offsets, stride, rule, corners = grid
-    first, last = rows
     keys, items, behind = entries
     per_row = row_factor(stride)
     width, overflow = buckets
@@ -216,9 +206,7 @@ def spread(grid, climbs, cost, buckets, lowered, count, rows, limit, entries, he
             return -2, highest
         for i in range(n):
             v = lowered[i]
-            row = np.int64(np.uint64(v) * per_row >> FINE_ROW)
-            first[row] = min(first[row], np.int64(v))
-            last[row] = max(last[row], np.int64(v))
+            note(rows, per_row, np.uint64(v))
             key = cost[v]
             b = overflow if current == overflow else max(np.int64(min((key - base) * inverse, top)), current)
             e = spare
@@ -268,18 +256,8 @@ def spread(grid, climbs, cost, buckets, lowered, count, rows, limit, entries, he
                     n += _ONE
                 v = u + np.uint64(offsets[2 * k + 1])
                 diagonal = offered(key, own, climbs, v, u, (2 * k + 1) ^ 4, slant)
-                if (
-                    diagonal < cost[v]
-                    and cell_cost[v] < INF
-                    and (
-                        corners
-                        or max(
-                            cell_cost[u + np.uint64(offsets[2 * k])],
-                            cell_cost[u + np.uint64(offsets[(2 * k + 2) & 7])],
-                        )
-                        < INF
-                    )
-                ):
+                lower = diagonal < cost[v] and cell_cost[v] < INF
+                if lower and (corners or not is_shut(cell_cost, offsets, u, 2 * k + 1)):
                     cost[v] = diagonal
                     lowered[n] = v
                     n += _ONE
@@ -301,7 +279,7 @@ def point_near(grid, climbs, labels, rows):
 
 @helper
 def row_factor(stride):
-    """cell // stride is cell * this >> FINE_ROW, unsigned: exact while the grid's size * stride is below 2**44."""
+    """cell // stride is cell * this >> _FINE_ROW, unsigned: exact while the grid's size * stride is below 2**44."""
     return np.uint64((1 << 44) // stride + 1)
 
 
@@ -323,14 +301,9 @@ def _detach(grid, cost, parent, changed, before, limit, detached):
             detached[count] = x
             count += 1
         for k in range(8):
-            v = x + offsets[k]
-            way = parent[v]
-            if way == NONE:
-                continue
-            closed = lethal and not corners and cuts_corner(v, way, x, offsets)
-            if closed or way == (k + 4) & 7:
-                parent[v] = NONE
-                detached[count] = v
+            if leads_by(parent, offsets, x, k, lethal and not corners):
+                parent[x + offsets[k]] = NONE
+                detached[count] = x + offsets[k]
                 count += 1
     return _detach_behind(cost, parent, offsets, detached, count, limit)
 
@@ -368,8 +341,8 @@ def repair(grid, climbs, labels, changed, before, buckets, most, scratch):
     cell_cost, _, stride, _, _ = grid
     cost, parent, _ = labels
     rows, cheaper, detached, lowered, best, entries, heads = scratch
-    first, last = rows
-    any_cheaper = _any_cheaper(cell_cost, changed, before)
+    per_row = row_factor(stride)
+    any_cheaper = _note_cheaper(cheaper, per_row, cell_cost, changed, before)
     most_detached = most[1] if any_cheaper else most[0]
     many = np.int64(0)
     if parent.size:
@@ -379,10 +352,10 @@ def repair(grid, climbs, labels, changed, before, buckets, most, scratch):
     clear_rows(rows, cell_cost.size)
     count = np.int64(0)  # a literal would have `sweep` compiled twice
     if many:
-        _note(first, last, stride, detached, many)
+        for i in range(many):
+            note(rows, per_row, np.uint64(detached[i]))
         count = sweep(grid, climbs, cost, None, rows, INF, best, lowered, count)
     if any_cheaper:
-        _note_cheaper(cheaper, cell_cost, stride, changed, before)
         count = sweep(grid, climbs, cost, None, cheaper, ANY_COST, best, lowered, count)
     served, highest = spread(grid, climbs, cost, buckets, lowered, count, rows, 2 * many + most[2], entries, heads)
     if served < 0:
@@ -390,6 +363,7 @@ def repair(grid, climbs, labels, changed, before, buckets, most, scratch):
     if not parent.size:
         return served, highest
     # A cell beside one that changed may have a better neighbour now.
-    _note(first, last, stride, changed, changed.size)
+    for i in range(changed.size):
+        note(rows, per_row, np.uint64(changed[i]))
     point_near(grid, climbs, labels, rows)
     return served + many, highest

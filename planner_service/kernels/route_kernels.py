@@ -48,7 +48,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from planner_service.kernels.climbs import CLIMBS, step_price
+from planner_service.kernels.climbs import CLIMBS, entry_of, step_price
 from planner_service.kernels.decorators import helper, kernel, step_kernel
 from planner_service.kernels.layout import (
     BOX,
@@ -59,6 +59,7 @@ from planner_service.kernels.layout import (
     SQRT2_EXACT,
     check_cells,
     diagonal_length,
+    is_shut,
     step_offsets,
 )
 
@@ -317,10 +318,8 @@ def _cheapest_way(grid, cost, beside, v, at):
     for j in range(8):
         k = 2 * j if j < 4 else 2 * j - 7
         key = cost[at + beside[k]] + cell_cost[v + offsets[k]] * lengths[k & 1]
-        if key < best:
-            shut = max(cell_cost[v + offsets[k - (k & 1)]], cell_cost[v + offsets[(k + 1) & 7]]) == INF
-            if not (k & 1 and shut and not corners):
-                best, way = key, np.uint8(k)
+        if key < best and (corners or not k & 1 or not is_shut(cell_cost, offsets, v, k)):
+            best, way = key, np.uint8(k)
     return way
 
 
@@ -407,9 +406,7 @@ def _climb(flight, pace, before, cell, both):
         return 0.0
     height, factors, per_metre, _ = flight
     half = np.float32(factors.size >> 1)
-    at = (height[cell] - height[before]) * per_metre[np.int64(both)]
-    at = at if at == at else np.float32(0.0)
-    entry = np.uint64(min(max(at, -half), half) + half + np.float32(0.5))
+    entry = np.uint64(entry_of(height[cell] - height[before], per_metre[np.int64(both)], half))
     length = math.sqrt(2.0) if both else 1.0
     return (np.float64(factors[entry]) - 1.0) * np.float64(pace[np.uint64(cell)]) * length
 

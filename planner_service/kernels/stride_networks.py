@@ -43,6 +43,7 @@ from planner_service.kernels.layout import (
     Ints,
     Longs,
     check_cells,
+    is_shut,
     step_length,
 )
 
@@ -59,9 +60,7 @@ def _leads(cell_cost, offsets, corners, u, k):
     allowed."""
     if not cell_cost[u + offsets[k]] < INF:
         return False
-    if not k & 1 or corners:
-        return True
-    return max(cell_cost[u + offsets[k - 1]], cell_cost[u + offsets[(k + 1) & 7]]) < INF
+    return not k & 1 or corners or not is_shut(cell_cost, offsets, u, k)
 
 
 @kernel(f"({GRID}, i8, i4[::1], u4[::1], u4[::1])")
@@ -397,10 +396,8 @@ def _follow(grid, climbs, labels, network, stamps, link, u, trail):
         v = u + offsets[k]
         if stamp[v] < now:
             visited += _tighten(cell_cost, climbs, cost, parent, stamp, now, offsets, rule, v, trail)
-        odd = k & 1
-        offer = offered(cost[u], cell_cost[u], climbs, v, u, k ^ 4, step_length(rule, odd))
-        shut = max(cell_cost[u + offsets[k - 1]], cell_cost[u + offsets[(k + 1) & 7]]) == INF
-        if offer < cost[v] and cell_cost[v] < INF and (corners or not odd or not shut):
+        offer = offered(cost[u], cell_cost[u], climbs, v, u, k ^ 4, step_length(rule, k & 1))
+        if offer < cost[v] and _leads(cell_cost, offsets, corners, u, k):
             cost[v] = offer
             parent[v] = (k + 4) & 7
             stamp[v] = now

@@ -146,8 +146,8 @@ class Scratch(NamedTuple):
     """(w,) s; cell costs."""
     inner: Doubles
     """(w,) s; offset of each cell; 0 around the tile."""
-    less: Ints
-    """(w,) whether a cell is offered less."""
+    least: Doubles
+    """(w,) s; the least that a cell is offered, from the first cell of the tile on."""
     queue: Ints
     """(w,) cells; while costs spread, the items of a heap."""
     keys: Floats
@@ -204,7 +204,7 @@ def make_scratch(tiles: int, most: int) -> Scratch:
         cost=np.full(size, np.inf),
         own=np.full(size, np.inf),
         inner=np.zeros(size),
-        less=np.zeros(size, np.int32),
+        least=np.zeros(size),
         queue=np.empty(size, np.int32),
         keys=np.zeros(size, np.float32),
         code=np.full(size, NONE),
@@ -294,28 +294,42 @@ def next_in(which, n, sets, words):
 
 
 @helper
+def rows_about(t, across, tiles):
+    """(row0, col0, row1, col1) of a tile and those about it; row1 and col1 lie outside.
+
+    tiles  how many there are in all
+    """
+    row, col = t // across, t % across
+    return max(row - 1, 0), max(col - 1, 0), min(row + 2, tiles // across), min(col + 2, across)
+
+
+@helper
 def push_around(which, t, across, place, sets):
     """Puts a tile and those about it into a set."""
-    row, col = t // across, t % across
-    down = place.size // across
-    for i in range(max(row - 1, 0), min(row + 2, down)):
-        for j in range(max(col - 1, 0), min(col + 2, across)):
-            sets[which, place[i * across + j]] = 1
+    row0, col0, row1, col1 = rows_about(t, across, place.size)
+    for row in range(row0, row1):
+        for other in range(row * across + col0, row * across + col1):
+            sets[which, place[other]] = 1
+
+
+@helper
+def _copy_rows(source, first, source_stride, rows, cols, target, at, target_stride):
+    """Copies rows of cells, from `first` on, to `at` and below. Vectorises."""
+    for row in range(rows):
+        i, j = np.uint64(first + row * source_stride), np.uint64(at + row * target_stride)
+        for col in range(np.uint64(cols)):
+            target[j + col] = source[i + col]
 
 
 @helper
 def _load_own(t, grid, across, scratch):
     """Puts cell costs of a tile on the scratch."""
-    cell_cost, _, stride, _, _ = grid
     own = scratch.own
     origin, rows, cols = corner_of(grid, across, t)
     if rows < SIDE or cols < SIDE:
         for i in range(own.size):
             own[i] = np.inf
-    for row in range(rows):
-        g, at = np.uint64(origin + row * stride), np.uint64((row + 1) * WIDE + 1)
-        for col in range(np.uint64(cols)):
-            own[at + col] = cell_cost[g + col]
+    _copy_rows(grid[0], origin, grid[2], rows, cols, own, WIDE + 1, WIDE)
 
 
 @helper
@@ -375,11 +389,7 @@ def load_offsets(t, grid, tree, tiles, scratch):
     names, inner, kept, place = scratch.border, scratch.inner, scratch.kept, scratch.place
     _load_own(t, grid, across, scratch)
     if place[t] >= 0:
-        for row in range(SIDE):
-            i = np.uint64((np.int64(place[t]) << 2 * BITS) + (row << BITS))
-            at = np.uint64((row + 1) * WIDE + 1)
-            for col in range(np.uint64(SIDE)):
-                inner[at + col] = kept[i + col]
+        _copy_rows(kept, np.int64(place[t]) * CELLS, SIDE, SIDE, SIDE, inner, WIDE + 1, WIDE)
         return
     _load_parents(t, grid, tree, across, scratch)
     for j in range(many[t]):
@@ -402,11 +412,7 @@ def _cache_offsets(t, scratch):
         holder[next] = t
         place[t] = next
         holder[holder.size - 1] = next + 1 if next + 2 < holder.size else 0
-    for row in range(SIDE):
-        i = np.uint64((np.int64(place[t]) << 2 * BITS) + (row << BITS))
-        at = np.uint64((row + 1) * WIDE + 1)
-        for col in range(np.uint64(SIDE)):
-            kept[i + col] = inner[at + col]
+    _copy_rows(inner, WIDE + 1, WIDE, SIDE, SIDE, kept, np.int64(place[t]) * CELLS, SIDE)
 
 
 @helper
@@ -450,23 +456,18 @@ def relabel_tile(t, grid, tree, tiles, scratch):
             count += 1
     many[t] = count
     _follow(t, grid, across, scratch)
-    for row in range(SIDE):
-        i, at = np.uint64(t * CELLS + (row << BITS)), np.uint64((row + 1) * WIDE + 1)
-        for col in range(np.uint64(SIDE)):
-            piece[i + col] = name[at + col]
+    _copy_rows(name, WIDE + 1, WIDE, SIDE, SIDE, piece, t * CELLS, SIDE)
     store_offsets(t, tree, scratch)
 
 
 @helper
 def request_around(tiles, t, what):
     """Asks something of a tile, and of those about it."""
-    across = tiles.across
-    wanted = tiles.wanted
-    row, col = t // across, t % across
-    down = wanted.size // across
-    for i in range(max(row - 1, 0), min(row + 2, down)):
-        for j in range(max(col - 1, 0), min(col + 2, across)):
-            wanted[i * across + j] |= what
+    wanted, across = tiles.wanted, tiles.across
+    row0, col0, row1, col1 = rows_about(t, across, wanted.size)
+    for row in range(row0, row1):
+        for other in range(row * across + col0, row * across + col1):
+            wanted[other] |= what
 
 
 @kernel(GRID, TREE, TILES, SCRATCH, "i8[::1]", "u1[::1]")

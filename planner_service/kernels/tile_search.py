@@ -17,41 +17,44 @@ import numpy as np
 from planner_service.kernels import tile_pieces
 from planner_service.kernels.decorators import helper, kernel
 from planner_service.kernels.heap_and_buckets import heap_lower, heap_pop
-from planner_service.kernels.layout import BOX, GRID, INF, NONE, RULE_FOUR, RULE_OCTILE, SQRT2_EXACT, cuts_corner
+from planner_service.kernels.layout import (
+    BOX,
+    GRID,
+    HUGE,
+    INF,
+    NONE,
+    RULE_FOUR,
+    RULE_OCTILE,
+    SQRT2_EXACT,
+    is_shut,
+    leads_by,
+)
+from planner_service.kernels.parents_from_costs import least_offers
 from planner_service.kernels.piece_totals import begin, evaluate_totals, queue_checks, settle
 from planner_service.kernels.tile_pieces import BITS, CELLS, PIECES, SIDE, TOTAL, WIDE
 
-_ONE = np.uint64(1)
+_FIRST = np.uint64(WIDE + 1)
+"""The first cell of a tile, on the scratch."""
 _WINDOW = f"Tuple((f4[::1], u1[::1], {BOX}, f8))"
 
 
 @helper
-def _load_line(count, first, steps, other, grid, tree, scratch):
-    """Puts `count` cells of tile `other` on the scratch; there is no such tile where cells are lethal.
-
-    first  where the first is on the map, in its tile, on the scratch
-    steps  from one to the next, in the same order
-    """
-    cell_cost = grid[0]
-    piece, rim = tree.piece, tree.rim
-    cost, own = scratch.cost, scratch.own
-    g, cell, at = first
-    for _ in range(count):
-        own[at] = cell_cost[g]
-        cost[at] = np.inf
-        if cell_cost[g] < INF:
-            name = np.int64(piece[other * CELLS + cell])
-            at_exit = tree.total[other * PIECES + name, TOTAL]
-            cost[at] = at_exit + rim[other * PIECES + tile_pieces.border_index(cell)]
-        g += steps[0]
-        cell += steps[1]
-        at += steps[2]
+def _load_beside(t, row, col, origin, grid, tree, across, scratch):
+    """Puts a cell beside a tile on the scratch. Row and column are counted from the tile's first cell, which is
+    `origin`, padded."""
+    at, own = (row + 1) * WIDE + col + 1, grid[0][origin + row * grid[2] + col]
+    scratch.own[at] = own
+    scratch.cost[at] = np.inf
+    if own < INF:  # there is a tile
+        other = t + (row >> BITS) * across + (col >> BITS)
+        cell = ((row & (SIDE - 1)) << BITS) + (col & (SIDE - 1))
+        at_exit = tree.total[other * PIECES + np.int64(tree.piece[other * CELLS + cell]), TOTAL]
+        scratch.cost[at] = at_exit + tree.rim[other * PIECES + tile_pieces.border_index(cell)]
 
 
 @helper
 def _load_tile(t, grid, tree, tiles, scratch):
     """Puts a tile on the scratch, with the cells around."""
-    stride = grid[2]
     piece, across = tree.piece, tiles.across
     cost, inner = scratch.cost, scratch.inner
     tile_pieces.load_offsets(t, grid, tree, tiles, scratch)
@@ -65,40 +68,19 @@ def _load_tile(t, grid, tree, tiles, scratch):
         at = np.uint64((row + 1) * WIDE + 1)
         for col in range(np.uint64(cols)):
             cost[at + col] = tree.total[totals + np.uint64(piece[i + col]), TOTAL] + inner[at + col]
-    for down in range(-1, 2):
-        for right in range(-1, 2):
-            if not (down or right):
-                continue
-            # The first cell around on this side, counted from the tile's first; and how many there are.
-            row = rows if down > 0 else down
-            col = cols if right > 0 else right
-            count = 1 if down and right else (cols if down else rows)
-            other = t + down * across + right
-            cell = ((row & (SIDE - 1)) << BITS) + (col & (SIDE - 1))
-            at = (row + 1) * WIDE + col + 1
-            g = origin + row * stride + col
-            steps = (1, 1, 1) if down else (stride, SIDE, WIDE)
-            _load_line(count, (g, cell, at), steps, other, grid, tree, scratch)
+    for col in range(-1, cols + 1):
+        _load_beside(t, -1, col, origin, grid, tree, across, scratch)
+        _load_beside(t, rows, col, origin, grid, tree, across, scratch)
+    for row in range(rows):
+        _load_beside(t, row, -1, origin, grid, tree, across, scratch)
+        _load_beside(t, row, cols, origin, grid, tree, across, scratch)
 
 
 @helper
-def _mark_improvable(cost, own, begin, end, diagonal, corners, less):
-    """less := 1 where a cell is offered less than `KEPT` of its cost, 0 elsewhere. Without a branch, so that it
-    vectorises."""
-    s = np.uint64(WIDE)
-    for i in range(begin, end):
-        north, east, south, west = own[i - s], own[i + _ONE], own[i + s], own[i - _ONE]
-        best = min(min(cost[i - s] + north, cost[i + _ONE] + east), min(cost[i + s] + south, cost[i - _ONE] + west))
-        offer = cost[i - s + _ONE] + own[i - s + _ONE] * diagonal
-        best = min(best, offer if corners or max(north, east) < np.inf else np.inf)
-        offer = cost[i + s + _ONE] + own[i + s + _ONE] * diagonal
-        best = min(best, offer if corners or max(south, east) < np.inf else np.inf)
-        offer = cost[i + s - _ONE] + own[i + s - _ONE] * diagonal
-        best = min(best, offer if corners or max(south, west) < np.inf else np.inf)
-        offer = cost[i - s - _ONE] + own[i - s - _ONE] * diagonal
-        best = min(best, offer if corners or max(north, west) < np.inf else np.inf)
-        best = best if own[i] < np.inf else np.inf
-        less[i] = 1 if best < cost[i] * tile_pieces.KEPT else 0
+def _is_offered_less(i, cost, own, least):
+    """Returns True if a cell (unsigned) on the scratch may be entered and is offered less than `KEPT` of its
+    cost."""
+    return (least[i - _FIRST] < cost[i] * tile_pieces.KEPT) & (own[i] < np.inf)
 
 
 @helper
@@ -106,9 +88,7 @@ def _open(own, around, rule, corners, at, code):
     """Returns True if there is a step between a passable cell on the scratch and the one in this direction."""
     if not code & 1:
         return True
-    if rule == RULE_FOUR:
-        return False
-    return corners or max(own[at + around[code - 1]], own[at + around[(code + 1) & 7]]) < np.inf
+    return rule != RULE_FOUR and (corners or not is_shut(own, around, at, code))
 
 
 @helper
@@ -197,22 +177,24 @@ def _improve_tile(t, grid, tree, tiles, scratch):
     _, _, _, rule, corners = grid
     piece = tree.piece
     exits, many, across = tiles.exits, tiles.many, tiles.across
-    names, cost, own, less = scratch.border, scratch.cost, scratch.own, scratch.less
+    names, cost, own, least = scratch.border, scratch.cost, scratch.own, scratch.least
     queue, keys, spot = scratch.queue, scratch.keys, scratch.spot
     _load_tile(t, grid, tree, tiles, scratch)
     _, rows, cols = tile_pieces.corner_of(grid, across, t)
     diagonal = np.inf if rule == RULE_FOUR else (SQRT2_EXACT if rule == RULE_OCTILE else 1.0)
-    _mark_improvable(*(cost, own, np.uint64(WIDE + 1), np.uint64((rows + 1) * WIDE - 1), diagonal, corners, less))
+    last, limit = np.uint64((rows + 1) * WIDE - 1), INF if corners else HUGE
+    least_offers(own, cost, np.uint64(WIDE), _FIRST, last, diagonal, limit, None, least)
     count = 0
     for row in range(rows):
         first = np.uint64((row + 1) * WIDE + 1)
         some = np.int32(0)
         for col in range(np.uint64(cols)):
-            some |= less[first + col]
+            some |= np.int32(_is_offered_less(first + col, cost, own, least))
         if some:
             for col in range(cols):
                 at = (row + 1) * WIDE + col + 1
-                if less[at] and _relax(*(at, t, (row << BITS) + col, grid, tree, tiles, scratch)):
+                less = _is_offered_less(np.uint64(at), cost, own, least)
+                if less and _relax(*(at, t, (row << BITS) + col, grid, tree, tiles, scratch)):
                     count = heap_lower(keys, queue, spot, count, np.float32(cost[at]), at)
     if count == 0:
         return False
@@ -233,11 +215,9 @@ def _improve_tile(t, grid, tree, tiles, scratch):
 def _is_next(t, across, schedule):
     """Returns True if no tile about this one, of those to be checked, has an earlier turn."""
     place, turn, sets = schedule.place, schedule.turn, schedule.sets
-    row, col = t // across, t % across
-    down = place.size // across
-    for i in range(max(row - 1, 0), min(row + 2, down)):
-        for j in range(max(col - 1, 0), min(col + 2, across)):
-            other = i * across + j
+    row0, col0, row1, col1 = tile_pieces.rows_about(t, across, place.size)
+    for row in range(row0, row1):
+        for other in range(row * across + col0, row * across + col1):
             if turn[other] < turn[t] and sets[tile_pieces.CHECKING, place[other]]:
                 return False
     return True
@@ -246,12 +226,11 @@ def _is_next(t, across, schedule):
 @helper
 def _any_cut_off(t, wanted, across):
     """Returns True if a piece of a tile, or of those about it, has no path."""
-    row, col = t // across, t % across
-    down = wanted.size // across
+    row0, col0, row1, col1 = tile_pieces.rows_about(t, across, wanted.size)
     what = np.uint8(0)
-    for i in range(max(row - 1, 0), min(row + 2, down)):
-        for j in range(max(col - 1, 0), min(col + 2, across)):
-            what |= wanted[i * across + j]
+    for row in range(row0, row1):
+        for other in range(row * across + col0, row * across + col1):
+            what |= wanted[other]
     return what & tile_pieces.CUT_OFF != 0
 
 
@@ -361,12 +340,8 @@ def cut_parents(grid, tree, across, cells, before, changed):
         if lethal:
             parent[changed_cell] = NONE
         for code in range(8):
-            v = changed_cell + offsets[code]
-            way = parent[v]
-            if way == NONE:
-                continue
-            into = way == (code + 4) & 7
-            if into or (lethal and not corners and cuts_corner(v, way, changed_cell, offsets)):
+            if leads_by(parent, offsets, changed_cell, code, lethal and not corners):
+                v = changed_cell + offsets[code]
                 t, _ = tile_pieces.tile_of(v, stride, across)
                 changed[t] |= what
                 if lethal:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -45,34 +46,33 @@ def joined(parts: Sequence[Changes]) -> Changes:
 
 class CostRange:
     """The lowest and the highest of cell costs, or of what cells cost to the root: float32, none of them negative.
+    It is immutable, so that snapshots share it.
 
-    It is kept block by block, so that a change looks at its own blocks only.
+    It is found block by block, so that a change looks at its own blocks only.
 
-    ranges  int32 (3, n), of each block what the properties say of all, as bits
+    lowest   inf if there is no finite one
+    highest  the highest finite cost; 0 if there is none
+    last     the highest, inf with them; NaN is beyond that
     """
 
     def __init__(self, costs: Floats) -> None:
         self._ranges: NDArray[np.int32] = np.empty((3, -(-costs.size // BLOCK)), np.int32)
-        block_ranges(costs.view(np.int32), np.arange(self._ranges.shape[1]), self._ranges)
+        """Range of each block: what the attributes say of all, as bits."""
+        self._find(costs, np.arange(self._ranges.shape[1]))
 
-    def change(self, costs: Floats, cells: Cells) -> None:
-        """Becomes the range of the array after these cells of it have changed."""
-        block_ranges(costs.view(np.int32), np.unique(cells // BLOCK), self._ranges)
+    def after(self, costs: Floats, cells: Cells) -> CostRange:
+        """Returns the range of the array after these cells of it have changed."""
+        changed = copy.copy(self)
+        changed._ranges = self._ranges.copy()
+        changed._find(costs, np.unique(cells // BLOCK))
+        return changed
 
-    @property
-    def lowest(self) -> float:
-        """inf if there is no finite one."""
-        return float(self._ranges[0].view(np.float32).min())
-
-    @property
-    def highest(self) -> float:
-        """Highest finite cost; 0 if there is none."""
-        return float(self._ranges[1].view(np.float32).max())
-
-    @property
-    def last(self) -> float:
-        """The highest, inf with them; NaN is beyond that."""
-        return float(self._ranges[2].max().view(np.float32))
+    def _find(self, costs: Floats, blocks: Cells) -> None:
+        block_ranges(costs.view(np.int32), blocks, self._ranges)
+        lowest, highest, last = self._ranges
+        self.lowest = float(lowest.view(np.float32).min(initial=np.inf))
+        self.highest = float(highest.view(np.float32).max(initial=0.0))
+        self.last = float(last.max(initial=0).view(np.float32))
 
 
 _MANY = 1 << 11

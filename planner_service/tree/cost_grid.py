@@ -111,19 +111,12 @@ class CostGrid:
         self.cell_cost: Floats = NO_COSTS
         """float32 (size,), s: price of a straight step into each cell; inf is lethal, as is the border. Empty
         before `load` or `share`; `apply` writes it, in place."""
-        self.lowest_cell_cost = math.inf
-        """s; the lowest cell cost, inf if all is lethal. `load` and `apply` set it."""
-        self.highest_cell_cost = 0.0
-        """s; the highest finite cell cost, 0 if all is lethal. `load` and `apply` set it."""
         self.rounding = Rounding.of(NO_COSTS)
         """Rounding of labels of trees on this map. `load`, `share` and `apply` put another in its place."""
         self._time_cost: Floats | None = None
         """Same as `time_cost`, if that is an array of its own. `load` and `share` set it, `apply` writes it."""
-        self._lowest_time = math.inf
-        """s; the lowest of `time_cost`."""
         self._range = self._time_range = CostRange(NO_COSTS)
-        """Range of `cell_cost` and of `_time_cost`. `load` and `share` put others in their place, `apply` changes
-        them: those of a snapshot are not its own."""
+        """Range of `cell_cost` and of `_time_cost`. `load`, `share` and `apply` put others in their place."""
         self._offsets = layout.step_offsets(self.stride)
         self._shared: Floats | None = None
         """The original `cell_cost`, if that is mapped: `share` sets it, `load` resets it."""
@@ -147,6 +140,16 @@ class CostGrid:
     def padded(self) -> layout.PaddedGrid:
         """The same for kernels."""
         return self.cell_cost, self._offsets, self.stride, self.rule, self.corners
+
+    @property
+    def lowest_cell_cost(self) -> float:
+        """s; inf if all is lethal."""
+        return self._range.lowest
+
+    @property
+    def highest_cell_cost(self) -> float:
+        """s; the highest finite cell cost, 0 if all is lethal."""
+        return self._range.highest
 
     @property
     def buckets(self) -> layout.Buckets:
@@ -220,7 +223,8 @@ class CostGrid:
         its costs."""
         if not self.length_weight_s:
             return 1.0
-        return self._lowest_time / (self._lowest_time + self.length_weight_s) * (1.0 - 2.0**-22)
+        lowest = self._time_range.lowest
+        return lowest / (lowest + self.length_weight_s) * (1.0 - 2.0**-22)
 
     def share(self, time_cost: Floats) -> None:
         """Takes the `time_cost` that another cost grid of the same map and `metres` has loaded, from `open_array`.
@@ -273,12 +277,7 @@ class CostGrid:
 
     def _find_range(self) -> None:
         self._range = CostRange(self.cell_cost)
-        self._time_range = self._range if self._time_cost is None else CostRange(self._time_cost)
-        self._read_range()
-
-    def _read_range(self) -> None:
-        self.lowest_cell_cost, self.highest_cell_cost = self._range.lowest, self._range.highest
-        self._lowest_time = self._time_range.lowest
+        self._time_range = CostRange(NO_COSTS if self._time_cost is None else self._time_cost)
 
     def apply(self, pace: Floats, dirty: Sequence[Window]) -> Changes:
         """Takes what changed inside the dirty windows. Raises ValueError on a pace that is NaN, zero or negative;
@@ -293,15 +292,13 @@ class CostGrid:
         if self._time_cost is not None and boxes:
             # A change of time may be too small to be seen in a cost that holds the price of length, too.
             timed = [self._changed(pace, box, 0.0, self._time_cost).cells for box in boxes]
-            self._time_range.change(self._time_cost, np.concatenate(timed))
-            self._lowest_time = self._time_range.lowest
+            self._time_range = self._time_range.after(self._time_cost, np.concatenate(timed))
         changes = joined([NO_CHANGES, *found])
         if not changes.cells.size:
             return NO_CHANGES
         self._written[changes.cells // _BLOCK] = True
         self.rounding = self.rounding.after(changes)
-        self._range.change(self.cell_cost, changes.cells)
-        self._read_range()
+        self._range = self._range.after(self.cell_cost, changes.cells)
         return changes
 
     def _changed(self, pace: Floats, box: tuple[int, int, int, int], extra_s: float, costs: Floats) -> Changes:

@@ -11,7 +11,6 @@ tree's offset is an upper bound of the cost driven along the parents.
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -328,25 +327,15 @@ _SMALL = 1 << 16
 """Padded cells of a small window, whose scratch is worth keeping."""
 
 
-class GrownWindow(NamedTuple):
-    """Costs and parents of a window as a padded grid of its own, s.
-
-    way  s; cost from the old root to the new one inside the window; inf if no path exists
-    """
-
-    box: Box
-    cost: Floats
-    parent: NDArray[np.uint8] | None
-    way: float
-
-
 def grow_window(
     grid: CostGrid, root: int, old: int, window: Window, kept: KeptScratch, with_parents: bool
-) -> GrownWindow:
+) -> tuple[Box, Floats, NDArray[np.uint8] | None, float]:
     """Grows a window that holds the new root and the old one. Raises OutsideGridError where it is not inside the
     grid or does not hold both.
 
     kept  scratch of the last window of one tree
+    Returns its box; costs (s) and parents, as a padded grid of its own; and the cost, s, from the old root to the
+    new one inside it, inf if no path exists.
     """
     row0, col0, row1, col1 = box = box_of(grid, window)
     width = col1 - col0 + 2
@@ -360,7 +349,7 @@ def grow_window(
     climbs = None if grid.climbs is None else climbs_in(grid.climbs, grid.stride, box)
     scratch = kept if part.size <= _SMALL else None
     grow_tree(padded, climbs, (lowest, highest, grid.dearest_step), start, cost, parent, scratch)
-    return GrownWindow(box, cost, parent, float(cost[end]))
+    return box, cost, parent, float(cost[end])
 
 
 def box_of(grid: CostGrid, window: Window) -> Box:

@@ -1,7 +1,6 @@
 """Growth against an independent Dijkstra, on every rule; the same uncompiled and with bounds checks on."""
 
 import os
-import subprocess
 import sys
 import time
 from pathlib import Path
@@ -11,6 +10,7 @@ import pytest
 from support import slow_twins as naive
 from support.kernel_oracle import RATIOS, assert_equals_dijkstra, grown, loaded, random_grids
 from support.planner_strategies import RULES, random_pace
+from support.processes import words_of_python
 
 from planner_service.kernels import queue_dial, queue_wide_buckets
 from planner_service.tree.cost_grid import CostGrid
@@ -101,8 +101,6 @@ def test_a_pace_that_is_none_is_refused(pace: np.ndarray, complaint: str) -> Non
 
 
 _SMALL = """
-import sys
-grids, chased = map(int, sys.argv[1:])
 import numpy as np
 from laws.test_pieces_equal_dijkstra import chases
 from planner_service.goal_tree_cache import GoalTrees
@@ -141,7 +139,5 @@ print("fine")
 def test_kernels_do_the_same_uncompiled_and_never_leave_their_arrays(
     setting: str, grids: int, chased: int, tmp_path: Path
 ) -> None:
-    environment = {**os.environ, setting: "1", "NUMBA_CACHE_DIR": str(tmp_path)}
-    words = [sys.executable, "-W", "ignore", "-c", _SMALL, str(grids), str(chased)]
-    done = subprocess.run(words, env=environment, capture_output=True, text=True, timeout=280)
-    assert done.stdout.strip() == "fine", done.stderr[-2000:]
+    environment = {setting: "1", "NUMBA_CACHE_DIR": str(tmp_path), "PYTHONPATH": os.pathsep.join(sys.path)}
+    assert words_of_python(f"grids, chased = {grids}, {chased}\n{_SMALL}", **environment) == ["fine"]

@@ -9,7 +9,7 @@ from support import slow_twins as naive
 from support.effort import few
 from support.makers import target_pose
 from support.planner_strategies import STRATEGIES, random_pace
-from support.scripted_planner import TICK, World, chasers
+from support.scripted_planner import TICK, TRACKED, World, chasers
 
 from planner_service.followers import LONGEST_WAIT_NS
 from planner_service.planner import Planner
@@ -39,7 +39,8 @@ class Watched:
         config = PlannerConfig(strategy=STRATEGIES[seed // 3 % len(STRATEGIES)])  # type: ignore[arg-type]
         tree = TargetTree(self.grid, config)
         self.watch = TargetWatch("t0", self.grid, Counters())
-        self.planner = Planner(self.watch, 7, config, tree, self.map, Counters())
+        search = TargetSearch(TRACKED, tree.cost_grid, 1.0)
+        self.planner = Planner(self.watch, 7, config, tree, self.map, Counters(), target_search=search)
         self.now_ns = self.seq = 0
         self.at: int | None = None
         """The target's place."""

@@ -71,7 +71,6 @@ class FakePlanner:
         self.pace = np.array(world.terrain.pace_s_per_m)
         self.cell: int | None = None
         self.requests: list[RouteRequest] = []
-        self.mute = False
         self.incarnation = incarnation
         self._tree = TargetTree(world.terrain.grid, PlannerConfig(strategy="full"))
         self.bus = world.bus(f"planner-{target}-{incarnation}")
@@ -89,13 +88,11 @@ class FakePlanner:
             case Heard(message=MarkSet() as marks):
                 self._mark(marks)
             case Asked(request=RouteRequest() as request):
-                if not self.mute:
-                    self.requests.append(request)
-                    event.answer(self._routes(request))
+                self.requests.append(request)
+                event.answer(self._routes(request))
                 event.end()
             case Asked(request=CostRequest() as costs):
-                if not self.mute:
-                    event.answer(self._costs(costs))
+                event.answer(self._costs(costs))
                 event.end()
             case _:
                 pass

@@ -164,6 +164,9 @@ class Play:
                 assert route.status is RouteStatus.UNREACHABLE
             else:
                 assert route.status is RouteStatus.OK
+        odd, begins = np.append(0, np.cumsum(routes.directions & 1)), np.append(0, routes.ends[:-1])
+        slant = math.sqrt(2) - 1 if self.config.neighbours == 8 and self.config.edge == "octile" else 0.0
+        length_m = routes.ends - begins + slant * (odd[routes.ends] - odd[begins])
         served = np.isfinite(optimum) & ~lethal & known
         cells = np.flatnonzero(served)
         last, seconds = naive.drive(self.grid, self.config, self.pace, self.rules["climb"], routes)
@@ -173,6 +176,7 @@ class Play:
         upper = self.tree.cost_to_go_at(cells)
         best = optimum[cells]
         np.testing.assert_allclose(cost, driven, rtol=1e-6)
+        np.testing.assert_allclose(routes.length_m[cells], length_m[cells], rtol=1e-5)
         assert (bound <= best * (1 + 1e-12)).all()
         assert (cost >= best * (1 - 1e-6)).all()
         assert (upper >= driven * (1 - 1e-4)).all()

@@ -16,7 +16,7 @@ from support.swarm_model import SwarmModel
 from planner_service.growth_times import MODEL_EXACT_NS_PER_CELL
 from planner_service.planning_process import Planning
 from planner_service.service import PlannerService
-from shared_map.terrain.terrain import terrain_of_pace
+from shared_map.terrain.terrain import Terrain, terrain_of_pace
 from swarm.bus.bus import AskEnded, Event, Heard, Post, Replied
 from swarm.bus.memory_bus import MemoryBus
 from swarm.bus.scheduler import InlineWorker
@@ -91,8 +91,16 @@ class Ear:
         self.world.run(0.01)
         return self.replies
 
-    def routes(self, *cells: int, **fields: Any) -> RouteReply:
-        (reply,) = self.ask(ROUTE, RouteRequest(cells=list(cells), **fields), target="t")
+    def answer(self, topic: Topic, request: Message, **fields: Any) -> Any:
+        """The one answer, once the question has ended; None if it was refused."""
+        self.ended.clear()
+        self.ask(topic, request, **fields)
+        while not self.ended:
+            self.world.run(0.1)
+        return self.replies[0] if self.replies else None
+
+    def routes(self, *cells: int, target: str = "t", **fields: Any) -> RouteReply:
+        (reply,) = self.ask(ROUTE, RouteRequest(cells=list(cells), **fields), target=target)
         assert isinstance(reply, RouteReply)
         return reply
 
@@ -109,8 +117,36 @@ def planning(world: SwarmModel, role: str, id: str, incarnation: int = 1) -> Cal
     return lambda bus, post: Planning(setup, world.terrain, bus, post, worker)
 
 
-class Swarm(SwarmModel):
-    """A terrain, planners, a tracker of targets, and an agent that marks."""
+class Planners(SwarmModel):
+    """A terrain, planners, a tracker of targets, and a client.
+
+    cells  target -> where it has been put
+    """
+
+    def __init__(self, terrain: Terrain, scenario: Scenario, all_kernels: Callable[[], bool] | None = None) -> None:
+        super().__init__(terrain=terrain, scenario=scenario)
+        self.ear = Ear(self)
+        self._all_kernels = all_kernels
+        self.planners = {id: self.planner(id) for id in scenario.target_ids}
+        self.cells: dict[str, int] = {}
+        self._seq = 0
+        self._track()
+
+    def planner(self, target: str, incarnation: int = 1) -> PlannerService:
+        plans = planning(self, "planner", target, incarnation)
+        name = f"planner-{target}-{incarnation}"
+        return self.start(name, lambda bus, post: PlannerService(plans(bus, post), self._all_kernels), phase_ns=0)
+
+    def _track(self) -> None:
+        """Ten poses a second of every target that has been put somewhere."""
+        self._seq += 1
+        for id, cell in self.cells.items():
+            self.ear.bus.publish(POSE, target_pose(id, cell, seq=self._seq), target=id)
+        self.scheduler.after(TICK, self._track)
+
+
+class Swarm(Planners):
+    """The same, and an agent that marks."""
 
     def __init__(
         self,
@@ -124,25 +160,8 @@ class Swarm(SwarmModel):
             targets=(TargetConfig(count=targets),),
             planner=PlannerConfig(strategy=strategy, k_min=1, cpu_budget=cpu_budget),
         )
-        super().__init__(terrain=terrain_of_pace(self.pace, RES), scenario=scenario)
-        self.ear = Ear(self)
-        self.planners = {id: self.planner(id) for id in self.scenario.target_ids}
-        self.cells: dict[str, int] = {}
-        self._seq = 0
-        self._track()
+        super().__init__(terrain_of_pace(self.pace, RES), scenario)
         self.author = self.writer("a0.1")
-
-    def planner(self, target: str, incarnation: int = 1) -> PlannerService:
-        plans = planning(self, "planner", target, incarnation)
-        name = f"planner-{target}-{incarnation}"
-        return self.start(name, lambda bus, post: PlannerService(plans(bus, post)), phase_ns=0)
-
-    def _track(self) -> None:
-        """Ten poses a second of every target that has been put somewhere."""
-        self._seq += 1
-        for id, cell in self.cells.items():
-            self.ear.bus.publish(POSE, target_pose(id, cell, seq=self._seq), target=id)
-        self.scheduler.after(TICK, self._track)
 
     def mark(self, *cells: int, kind: MarkKind = MarkKind.LETHAL, pace: float = 0.0) -> None:
         self.author.sync.publish(self.author.replica.write(list(cells), kind, pace, self.now_ns))

@@ -7,6 +7,7 @@ import os
 import re
 import signal
 import subprocess
+import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
@@ -48,6 +49,15 @@ class Child:
                 os.kill(pid, signal.SIGKILL)
         self.process.kill()
         self.process.wait(10)
+
+
+def words_of_python(code: str, *within: str, **environment: str) -> list[str]:
+    """Runs code in a fresh Python, started by the command `within`; it must end well. Returns what it prints, by
+    words."""
+    command = [*within, sys.executable, "-W", "ignore", "-c", code]
+    done = subprocess.run(command, env=os.environ | environment, capture_output=True, text=True, timeout=300)
+    assert done.returncode == 0, done.stderr[-2000:]
+    return done.stdout.split()
 
 
 def eventually(

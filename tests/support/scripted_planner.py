@@ -12,8 +12,9 @@ from support.makers import target_pose
 
 from planner_service.growth_times import GrowthTimes
 from planner_service.planner import Action, Planner, Work
+from planner_service.target_search import Hidden, TargetSearch
 from planner_service.target_tree import TargetTree, Update
-from planner_service.tracker_notes import TargetWatch, Tell
+from planner_service.tracker_notes import TargetWatch
 from planner_service.tree.partitioned_tree import GrownTree
 from shared_map.cost_map import CostMap
 from shared_map.terrain.terrain import terrain_of_pace
@@ -30,6 +31,7 @@ from swarm.wire.route_columns import Route, RouteBatch, RouteStatus
 ROWS, COLS = 20, 30
 GRID = GridSpec(ROWS, COLS, 10.0)
 TICK = NS_PER_S // 10
+TRACKED = Hidden(True, sense_range_m=1.0, capture_range_m=1.0, slowness=1.0, jumps=False, seed="")
 
 
 class NotedTimes(GrowthTimes):
@@ -149,18 +151,17 @@ class World:
             self.counters,
             stopwatch=stopwatch,
             newest_mark_ns=self._newest,
+            target_search=TargetSearch(TRACKED, self.tree.cost_grid, 1.0),
         )
         self.now_ns = 0
         self.told: list[PlannerStatus] = []
-        self.notes: list[Tell] = []
 
     def _newest(self) -> int | None:
         stamp_ns, self.newest_mark_ns = self.newest_mark_ns, None
         return stamp_ns
 
-    def pose(self, row: int, col: int, seq: int = 1, incarnation: int = 1) -> None:
-        cell = GRID.cell(row, col)
-        self.watch.on_pose(pose(cell, seq, incarnation), self.now_ns)
+    def pose(self, row: int, col: int, seq: int = 1) -> None:
+        self.watch.on_pose(pose(GRID.cell(row, col), seq), self.now_ns)
 
     def mark(self, *cells: int, stamp_ns: int | None = None) -> None:
         kinds = np.full(len(cells), MarkKind.LETHAL, np.uint8)
@@ -168,11 +169,10 @@ class World:
         self.newest_mark_ns = stamp_ns
 
     def tick(self) -> list[Action]:
-        """All actions of a tick, except the status twice a second and sentences for people."""
+        """All actions of a tick, except the status twice a second."""
         self.now_ns += TICK
         actions = self.planner.tick(self.now_ns)
         self.told.extend(action for action in actions if isinstance(action, PlannerStatus))
-        self.notes.extend(self.watch.drain(self.now_ns))
         return [action for action in actions if not isinstance(action, PlannerStatus)]
 
     def ask(self, *cells: int, **fields: Any) -> RouteReply:
@@ -181,9 +181,8 @@ class World:
         assert isinstance(reply, RouteReply)
         return reply
 
-    def chasers(self, *vehicles: tuple[str, int], target: str = "t0", stamp_ns: int | None = None) -> None:
-        told = chasers(*vehicles, target=target, stamp_ns=self.now_ns if stamp_ns is None else stamp_ns)
-        self.planner.on_chasers(told, self.now_ns)
+    def chasers(self, *vehicles: tuple[str, int]) -> None:
+        self.planner.on_chasers(chasers(*vehicles, stamp_ns=self.now_ns), self.now_ns)
 
     def grow(self, action: Action, took_ns: int = 5_000_000) -> list[Action]:
         """Does a growth that was asked for."""

@@ -10,11 +10,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.effort import few
 from support.map_strategies import set_of
-from support.planner_swarm import TICK, Ear, planning
-from support.swarm_model import SwarmModel
+from support.planner_swarm import Planners
 
 from planner_service import service as planner_service
-from planner_service.service import PlannerService
 from shared_map.cost_map import CostMap
 from shared_map.keeper.zone_orders import rows_of
 from shared_map.pace_measurements import ONE, Measurement
@@ -28,10 +26,10 @@ from swarm.config.toml_files import parse_scenario
 from swarm.grid import TILE_CELLS, walk
 from swarm.wire.messages.map_data import MarkKind
 from swarm.wire.messages.orders import Obey
-from swarm.wire.messages.planning import CostRequest, RouteRequest, TargetPose
+from swarm.wire.messages.planning import CostRequest, RouteRequest
 from swarm.wire.messages.vehicles import Chasers
 from swarm.wire.route_columns import RouteStatus
-from swarm.wire.topics import CHASERS, COST, POSE, ROUTE
+from swarm.wire.topics import CHASERS, COST, ROUTE
 
 _TEXT = """
 seed = 3
@@ -91,21 +89,19 @@ _BATCHES = st.lists(st.tuples(st.sampled_from([0, 0, 1, 2, 3, 4]), _STATEMENTS),
 
 
 @settings(max_examples=few(60))
-@given(batches=_BATCHES, seed=st.integers(0, 1 << 30))
-def test_marks_mean_the_same_however_they_come_and_open_nothing_that_a_class_cannot_drive(batches, seed):
+@given(_BATCHES)
+def test_a_class_reads_marks_by_its_own_rule_and_they_open_nothing_that_it_cannot_drive(batches):
     _, terrain, classes = _made()
-    in_turn, at_once = (ClassMaps(CostMap(terrain), classes, _NUMBERS) for _ in range(2))
+    maps = ClassMaps(CostMap(terrain), classes, _NUMBERS)
     said: dict[int, dict[int, Any]] = {number: {} for number in range(5)}
     for number, batch in batches:
-        _apply(in_turn, batch, number)
-        said[number] |= {each[0]: each for each in batch}
-    for number in np.random.default_rng(seed).permutation(5).tolist():
-        _apply(at_once, list(said[number].values()), number)
-    common = in_turn.common
-    assert np.array_equal(common.pace_s_per_m, at_once.common.pace_s_per_m)
-    for name, cost_map in in_turn.of.items():
+        once = {each[0]: each for each in batch}
+        cells, kinds, paces = (np.array([each[n] for each in once.values()]) for n in range(3))
+        maps.apply(cells.astype(np.uint32), kinds.astype(np.uint8), paces.astype(np.float32), number)
+        said[number] |= once
+    common = maps.common
+    for name, cost_map in maps.of.items():
         own, own_said = classes[name], said[_NUMBERS[name]]
-        assert np.array_equal(cost_map.pace_s_per_m, at_once.of[name].pace_s_per_m)
         assert np.isinf(cost_map.pace_s_per_m[np.isinf(own.ground_s_per_m)]).all()
         closed_by_mark = np.isinf(common.ground_s_per_m) & np.isfinite(terrain.ground_s_per_m)
         assert np.isinf(cost_map.pace_s_per_m[closed_by_mark]).all()
@@ -120,49 +116,25 @@ def test_marks_mean_the_same_however_they_come_and_open_nothing_that_a_class_can
                 assert np.isinf(cost_map.ground_s_per_m.item(cell))
             elif kind == MarkKind.PACE and not closed:
                 assert cost_map.ground_s_per_m.item(cell) == max(np.float32(pace), np.float32(own.least_s_per_m))
-    same = in_turn.of["same"]
+    same = maps.of["same"]
     open_before = np.isfinite(terrain.pace_s_per_m)
     if not any(each[1] != MarkKind.CLEAR for each in said[_NUMBERS["same"]].values()):
         assert np.array_equal(same.pace_s_per_m[open_before], common.pace_s_per_m[open_before])
 
 
-def _apply(maps: ClassMaps, batch: list[Any], class_number: int = 0) -> None:
-    """Makes these the statements, of a cell that is named twice the last."""
-    once = {each[0]: each for each in batch}.values()
-    cells = np.array([each[0] for each in once], np.uint32)
-    kinds = np.array([each[1] for each in once], np.uint8)
-    maps.apply(cells, kinds, np.array([each[2] for each in once], np.float32), class_number)
-
-
 # --- planners -------------------------------------------------------------------------------------------------
 
 
-class _World(SwarmModel):
+class _World(Planners):
     def __init__(self, all_kernels: Callable[[], bool] | None = None) -> None:
         scenario, terrain, _ = _made(_DRONE)
-        super().__init__(terrain=terrain, scenario=scenario)
-        self.ear = Ear(self)
-        plans = planning(self, "planner", "t")
-        self.service = self.start(
-            "planner-t", lambda bus, post: PlannerService(plans(bus, post), all_kernels), phase_ns=0
-        )
-        self.target = _open_cell()
-        self._seq = 0
-        self._track()
+        super().__init__(terrain, scenario, all_kernels)
+        self.service = self.planners["t"]
+        self.target = self.cells["t"] = _open_cell()
         self.run(2.0)
 
-    def _track(self) -> None:
-        self._seq += 1
-        pose = TargetPose(target="t", incarnation=1, seq=self._seq, stamp_ns=0, cell=self.target, x_m=0, y_m=0)
-        self.ear.bus.publish(POSE, pose, target="t")
-        self.scheduler.after(TICK, self._track)
-
     def ask(self, request: RouteRequest | CostRequest) -> Any:
-        self.ear.ended.clear()
-        self.ear.ask(ROUTE if isinstance(request, RouteRequest) else COST, request, target="t")
-        while not self.ear.ended:
-            self.run(0.1)
-        return self.ear.replies[0] if self.ear.replies else None
+        return self.ear.answer(ROUTE if isinstance(request, RouteRequest) else COST, request, target="t")
 
     def trees(self) -> list[str]:
         return list(self.service._planners)

@@ -1,13 +1,12 @@
 """Builders share the work, planners find what they compiled, and no kernel is forgotten."""
 
 import os
-import subprocess
 import sys
-import textwrap
 from pathlib import Path
 from typing import Any
 
 import pytest
+from support.processes import words_of_python
 
 from planner_service import kernel_build
 from planner_service.any_angle_routes import pulls
@@ -123,15 +122,9 @@ print(sum(map(is_loaded, all)))
 
 
 def run(tmp_path: Path, script: str) -> list[str]:
-    file = tmp_path / "several.py"
-    file.write_text(textwrap.dedent(script))
-    here = Path(kernel_build.__file__).parents[1]
-    environment = {**os.environ, "NUMBA_CACHE_DIR": str(tmp_path / "cache"), "PYTHONPATH": str(here)}
-    done = subprocess.run(
-        [sys.executable, "-W", "ignore", str(file)], env=environment, capture_output=True, text=True, timeout=240
-    )
-    assert done.returncode == 0, done.stderr[-2000:]
-    return done.stdout.split()
+    (tmp_path / "several.py").write_text(script)  # numba keeps code of files only
+    paths = f"{tmp_path}:{Path(kernel_build.__file__).parents[1]}"
+    return words_of_python("import several", NUMBA_CACHE_DIR=str(tmp_path / "cache"), PYTHONPATH=paths)
 
 
 def test_three_builders_compile_each_kernel_once_and_all_of_them_see_each(tmp_path: Path) -> None:

@@ -2,13 +2,12 @@
 
 import os
 import shutil
-import subprocess
-import sys
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import CodeType
 
 import pytest
+from support.processes import words_of_python
 
 from planner_service.kernel_build import all_kernels
 from planner_service.kernels import decorators
@@ -64,16 +63,7 @@ def call(folder, *, within=(), code=_CALL, **environment):
     """(f(7), cache hits, cache misses) in a fresh process, started by the command `within`."""
     settings = {"PYTHONPATH": str(folder.parent), "PYTHONDONTWRITEBYTECODE": "1"}
     settings = {"NUMBA_CACHE_DIR": str(folder.parent / "cache")} | settings | environment
-    done = subprocess.run(
-        [*within, sys.executable, "-c", code],
-        env={**os.environ, **settings},
-        capture_output=True,
-        text=True,
-        timeout=120,
-    )
-    assert done.returncode == 0, done.stderr[-2000:]
-    value, hits, misses = map(int, done.stdout.split())
-    return value, hits, misses
+    return tuple(map(int, words_of_python(code, *within, **settings)))
 
 
 def test_a_kernel_is_compiled_once_and_again_when_a_helper_in_another_file_changes(folder: Path) -> None:

@@ -36,7 +36,7 @@ class PlacesWorld(SwarmModel):
         super().__init__(terrain=terrain_of_pace(pace, RES), scenario=parse_scenario(f"[[targets]]\n{groups}"))
         plans, self._job = planning(self, "places", job), job
         self.service = self.start("places", lambda bus, post: PlacesService(plans(bus, post)))
-        self.client = self.bus("client")
+        self.client, self._author = self.bus("client"), self.writer(f"{job}.a0.1")
         self.pushed: list[PushedRoute] = []
         self.client.subscribe(PUSHED_ROUTE, lambda event: self.pushed.append(event.message))
         self.run(1.0)
@@ -49,6 +49,13 @@ class PlacesWorld(SwarmModel):
         )
         told = Chasers(target=None, author=agent, stamp_ns=self.now_ns, ids=ids, cells=cells, goals=places)
         self.client.publish(SENT, told, places=self._job, author=agent)
+
+    def mark(self, cells: Any, paces: Any) -> None:
+        """Marks cells as lethal, or with a pace."""
+        paces = np.broadcast_to(np.asarray(paces, np.float32), len(cells))
+        kinds = np.where(np.isinf(paces), np.uint8(MarkKind.LETHAL), np.uint8(MarkKind.PACE)).astype(np.uint8)
+        stated = np.where(np.isinf(paces), np.float32(0), paces).astype(np.float32)
+        self._author.sync.publish(self._author.replica.write(cells, kinds, stated, self.now_ns))
 
     def ask(self, to: int, *cells: int, asker: str = "rover.r1", **fields: Any) -> list[Event]:
         """The list to which the events of a question are added."""
@@ -77,9 +84,7 @@ class PlacesWorld(SwarmModel):
 @pytest.mark.seeds(5)
 def test_routes_are_as_an_oracle_has_them_while_marks_change_the_map(seed: int) -> None:
     pace, chance = rough(seed), random.Random(seed)
-    world = PlacesWorld(pace)
-    writer = world.writer("all.a0.1")
-    now = np.array(pace)
+    world, now = PlacesWorld(pace), np.array(pace)
     for _ in range(6):
         for _ in range(4):
             to, *cells = (chance.randrange(GRID.cells) for _ in range(4))
@@ -97,12 +102,9 @@ def test_routes_are_as_an_oracle_has_them_while_marks_change_the_map(seed: int) 
                     assert route.cost_s == pytest.approx(best[cell], rel=1e-5)
                     assert best[cell] * (1 - 1e-5) <= route.lower_bound_s * (1 + 2e-5) <= route.cost_s * (1 + 3e-5)
         marked = np.array(sorted({chance.randrange(GRID.cells) for _ in range(30)}), np.uint32)
-        lethal = np.array([chance.random() < 0.5 for _ in marked])
-        paces = np.where(lethal, np.inf, 0.4).astype(np.float32)
-        marked, lethal, paces = (each[np.isfinite(pace.reshape(-1)[marked])] for each in (marked, lethal, paces))
-        kinds = np.where(lethal, np.uint8(MarkKind.LETHAL), np.uint8(MarkKind.PACE)).astype(np.uint8)
-        stated = np.where(lethal, np.float32(0), paces).astype(np.float32)
-        writer.sync.publish(writer.replica.write(marked, kinds, stated, world.now_ns))
+        marked = marked[np.isfinite(pace.reshape(-1)[marked])]
+        paces = np.array([chance.choice((np.inf, 0.4)) for _ in marked], np.float32)
+        world.mark(marked, paces)
         now.reshape(-1)[marked] = paces
         world.run(1.0)
 
@@ -111,8 +113,7 @@ def test_routes_are_as_an_oracle_has_them_while_marks_change_the_map(seed: int) 
 def test_a_vehicle_on_its_way_has_the_cheapest_route_whatever_changes_and_asks_once(seed: int) -> None:
     pace, chance = rough(seed, lethal=0.05), random.Random(seed)
     free = np.flatnonzero(np.isfinite(pace)).tolist()
-    world = PlacesWorld(pace)
-    writer, now = world.writer("all.a0.1"), np.array(pace)
+    world, now = PlacesWorld(pace), np.array(pace)
     goals = {f"a0-{n:02d}": (chance.choice(free), chance.choice(free)) for n in range(6)}
     given: dict[str, Route] = {}
     for id, (cell, to) in goals.items():
@@ -124,9 +125,7 @@ def test_a_vehicle_on_its_way_has_the_cheapest_route_whatever_changes_and_asks_o
         kept = [cell for pair in goals.values() for cell in pair]
         marked = np.array(sorted(set(chance.sample(free, 40)).difference(kept)), np.uint32)
         paces = np.array([chance.choice((0.05, 0.6, np.inf)) for _ in marked], np.float32)
-        kinds = np.where(np.isinf(paces), np.uint8(MarkKind.LETHAL), np.uint8(MarkKind.PACE)).astype(np.uint8)
-        stated = np.where(np.isinf(paces), np.float32(0), paces).astype(np.float32)
-        writer.sync.publish(writer.replica.write(marked, kinds, stated, world.now_ns))
+        world.mark(marked, paces)
         now.reshape(-1)[marked] = paces
         world.run(3.0)
         given.update({each.vehicle: each.route for each in world.pushed})
@@ -141,15 +140,13 @@ def test_a_vehicle_on_its_way_has_the_cheapest_route_whatever_changes_and_asks_o
     assert max(told.count(id) for id in goals) <= 6 + 1, "a change is pushed once"
     world.pushed.clear()
     world.tell(dict(list(goals.items())[:1]))
-    now.reshape(-1)[marked] = 0.01
-    writer.sync.publish(writer.replica.write(marked, MarkKind.PACE, 0.01, world.now_ns))
+    world.mark(marked, 0.01)
     world.run(3.0)
     assert {each.vehicle for each in world.pushed} <= {"a0-00"}, "who goes nowhere is pushed nothing"
 
 
 def test_a_cheaper_cell_has_only_those_vehicles_asked_for_again_whose_route_it_may_outdo() -> None:
     world = PlacesWorld(flat())
-    writer = world.writer("all.a0.1")
     goals = {f"a0-{row:02d}": (GRID.cell(row, 2), GRID.cell(row, 14)) for row in (2, 14, 26, 38)}
     for id, (cell, to) in goals.items():
         world.answer(to, cell, vehicles=[id], asker="agent.a0")
@@ -158,15 +155,17 @@ def test_a_cheaper_cell_has_only_those_vehicles_asked_for_again_whose_route_it_m
     wait = world.service._wait
     world.service._wait = lambda question: (asked.extend(question.request.vehicles), wait(question))[1]  # type: ignore[method-assign]
     for row, col, outdone in ((20, 45, []), (13, 8, ["a0-14"])):
-        writer.sync.publish(writer.replica.write([GRID.cell(row, col)], MarkKind.PACE, 0.05, world.now_ns))
+        world.mark([GRID.cell(row, col)], 0.05)
         world.run(2.0)
         world.tell(goals)
         assert asked == outdone
 
 
-def test_a_vehicle_of_a_group_which_may_not_know_is_pushed_nothing() -> None:
+def test_an_agent_of_another_group_is_refused_and_its_vehicles_are_pushed_nothing() -> None:
     groups = "\n".join(f"[[groups]]\nname = '{name}'\nreads = []\nvehicles = 1" for name in ("red", "blue"))
     world = PlacesWorld(flat(), groups, "red")
+    assert isinstance(world.settled(1, 2, "agent.a0")[0], Replied)
+    assert world.settled(1, 2, "agent.a1")[0].failure == "agent.a1 is of group blue: ask its own places"
     world.tell({"a0-00": (1, 300), "a1-00": (2, 300)}, "red.a0.1")
     world.run(0.5)
     world.tell({"a0-00": (1, 400), "a1-00": (2, 400)}, "red.a0.1")
@@ -175,14 +174,13 @@ def test_a_vehicle_of_a_group_which_may_not_know_is_pushed_nothing() -> None:
 
 
 def test_who_asks_for_the_vehicles_of_others_has_them_pushed_nothing_and_a_rover_does_not_come_first() -> None:
-    world = PlacesWorld(flat())
-    writer, to = world.writer("all.a0.1"), GRID.cell(20, 40)
+    world, to = PlacesWorld(flat()), GRID.cell(20, 40)
     for vehicle, asker in (("a0-00", "agent.a0"), ("a0-01", "rover.r1"), ("r1", "rover.r1"), ("r2", "rover.r1")):
         world.answer(to, GRID.cell(20, 2), vehicles=[vehicle], asker=asker)
     askers: list[str] = []
     wait = world.service._wait
     world.service._wait = lambda question: (askers.append(question.asker), wait(question))[1]  # type: ignore[method-assign]
-    writer.sync.publish(writer.replica.write([GRID.cell(20, 20)], MarkKind.LETHAL, 0.0, world.now_ns))
+    world.mark([GRID.cell(20, 20)], np.inf)
     world.run(2.0)
     assert sorted(each.vehicle for each in world.pushed) == ["a0-00", "r1"]
     assert sorted(each for each in askers if each != "all") == ["agent.a0", "rover.r1"]
@@ -211,10 +209,9 @@ def test_the_worker_alone_touches_trees_and_costs(monkeypatch: pytest.MonkeyPatc
             return method(*given)
 
         monkeypatch.setattr(kind, name, watched)
-    writer = world.writer("all.a0.1")
     for turn in range(4):
         world.answer(GRID.cell(20, 2 + turn), GRID.cell(20, 45))
-        writer.sync.publish(writer.replica.write([GRID.cell(21, 20 + turn)], MarkKind.PACE, 0.5, world.now_ns))
+        world.mark([GRID.cell(21, 20 + turn)], 0.5)
         world.run(0.5)
     assert set(touched) == {(name, True) for name in ("load", "apply", "cut", "begin")}
 
@@ -240,14 +237,11 @@ def test_marks_beside_a_goal_do_not_keep_a_far_asker_waiting(monkeypatch: pytest
     monkeypatch.setattr(places, "SLICE_CELLS", 20)
     monkeypatch.setattr(places, "_CELL_NS", 200_000)  # 0.4 s for the whole map
     world = PlacesWorld(flat())
-    writer = world.writer("all.a0.1")
-    to, beside = GRID.cell(2, 2), np.array([GRID.cell(3, 3)], np.uint32)
-    heard = world.ask(to, GRID.cell(30, COLS - 2), asker="agent.a0")
+    heard = world.ask(GRID.cell(2, 2), GRID.cell(30, COLS - 2), asker="agent.a0")
     for turn in range(40):
         if heard:
             break
-        kinds, paces = np.array([MarkKind.PACE], np.uint8), np.array([0.3 + 0.01 * (turn % 2)], np.float32)
-        writer.sync.publish(writer.replica.write(beside, kinds, paces, world.now_ns))
+        world.mark([GRID.cell(3, 3)], 0.3 + 0.01 * (turn % 2))
         world.run(0.1)
     assert heard[0].message.status == "ok"
 
@@ -295,11 +289,3 @@ def test_each_group_asks_a_process_that_knows_what_the_group_may_know() -> None:
     scenario = parse_scenario("\n".join(["[[targets]]", "[planner]", "places = true", *groups]))
     assert {name: place_job(scenario, name) for name in GROUPS} == {"red": "red", "blue": "blue", "green": "red"}
     assert places_of(scenario) == ["red", "blue"]
-
-
-def test_an_agent_of_another_group_is_refused() -> None:
-    groups = "\n".join(f"[[groups]]\nname = '{name}'\nreads = []\nvehicles = 1" for name in ("red", "blue"))
-    world = PlacesWorld(flat(), groups, "red")
-    assert isinstance(world.settled(1, 2, "agent.a0")[0], Replied)
-    ended = world.settled(1, 2, "agent.a1")[0]
-    assert ended.failure == "agent.a1 is of group blue: ask its own places"

@@ -6,9 +6,11 @@ import random
 import numpy as np
 import pytest
 from support.planner_swarm import COLS, GRID, RENEWS, RES, ROWS, Swarm, driven_s, flat, optimum_s, rough
+from support.scripted_planner import TRACKED
 
 from planner_service.kernel_build import load_all
 from planner_service.planner import MOST_ROUTES, Planner
+from planner_service.target_search import TargetSearch
 from planner_service.target_tree import TargetTree
 from planner_service.tracker_notes import TargetWatch
 from shared_map.cost_map import CostMap
@@ -178,7 +180,8 @@ def test_the_largest_answer_fits_into_one_message_with_its_routes_cut() -> None:
         pace[row + 1, 199 if row % 4 == 0 else 0] = 0.1
     tree = TargetTree(GridSpec(200, 200, RES), PlannerConfig())
     watch = TargetWatch("t", tree.cost_grid.grid, Counters())
-    planner = Planner(watch, 1, PlannerConfig(), tree, CostMap(terrain_of_pace(pace, RES)), Counters())
+    search, cost_map = TargetSearch(TRACKED, tree.cost_grid, 1.0), CostMap(terrain_of_pace(pace, RES))
+    planner = Planner(watch, 1, PlannerConfig(), tree, cost_map, Counters(), target_search=search)
     watch.on_pose(TargetPose(target="t", incarnation=1, seq=1, stamp_ns=0, cell=0, x_m=0, y_m=0), 0)
     planner.tick(0)
     whole = planner.answer(RouteRequest(cells=[198 * 200]), 0)

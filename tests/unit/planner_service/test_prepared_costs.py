@@ -45,8 +45,8 @@ def test_a_tree_on_shared_costs_is_the_one_on_its_own_to_the_bit_whatever_is_mar
                 tree.take_strides(tree.stride_job()())
             if version % 3 == 2:
                 tree.adopt(tree.full_job(target)(), pace, target, [], version, [])
-        np.testing.assert_array_equal(one._costs.cell_cost, other._costs.cell_cost)
-        np.testing.assert_array_equal(one._costs.snapshot().cell_cost, other._costs.cell_cost)
+        np.testing.assert_array_equal(one.cost_grid.cell_cost, other.cost_grid.cell_cost)
+        np.testing.assert_array_equal(one.cost_grid.snapshot().cell_cost, other.cost_grid.cell_cost)
         np.testing.assert_array_equal(one._tree.cost, other._tree.cost)
         np.testing.assert_array_equal(one._tree.parent, other._tree.parent)
         row, col = int(rng.integers(90)), int(rng.integers(80))

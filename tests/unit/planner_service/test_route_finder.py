@@ -68,14 +68,6 @@ def test_every_cell_has_an_answer_and_none_ends_the_interpreter() -> None:
     assert finder.route(5, 6).cost_s == 1.0
 
 
-@pytest.mark.parametrize(
-    ("pace", "complaint"), [(np.ones(4), "1 dimensions, expected 2"), (np.empty((0, 3)), "at least one cell")]
-)
-def test_a_pace_that_is_none_is_refused(pace: Any, complaint: str) -> None:
-    with pytest.raises(ValueError, match=complaint):
-        RouteFinder(pace, target=(0, 0))
-
-
 def test_a_change_that_is_refused_changes_nothing() -> None:
     finder = RouteFinder(np.ones((6, 7)), target=(0, 0))
     before = finder.cost_to_go_s()
@@ -128,6 +120,9 @@ def test_a_place_between_cells_and_an_unknown_setting_are_refused() -> None:
 )
 def test_what_is_no_pace_is_refused_with_and_without_a_target(pace: Any) -> None:
     ground = np.ones((3, 3))
+    for shape, complaint in ((4, "1 dimensions, expected 2"), ((0, 3), "at least one cell")):
+        with pytest.raises(ValueError, match=complaint):
+            RouteFinder(np.ones(shape), target=(0, 0))
     for call in (lambda: RouteFinder(np.atleast_2d(pace)), lambda: RouteFinder(ground, (0, 0)).change(pace)):
         with pytest.raises(ValueError, match="pace is"):
             call()

@@ -1,18 +1,18 @@
 """A planner whose target only vehicles see: one search for all who chase it, whatever their class."""
 
 import math
-from typing import Any
 
 import numpy as np
 import pytest
-from support.planner_swarm import Ear, planning
-from support.swarm_model import SwarmModel
+from support import slow_twins as naive
+from support.kernel_oracle import loaded
+from support.planner_swarm import Planners
 
-from planner_service.service import PlannerService
-from shared_map.terrain.terrain import Terrain, build_terrain
+from planner_service.target_search import Ways
+from shared_map.terrain.terrain import build_terrain
 from swarm.clock import NS_PER_S
 from swarm.config.toml_files import parse_scenario
-from swarm.grid import walk
+from swarm.grid import GridSpec, walk
 from swarm.wire.fields import column
 from swarm.wire.messages.planning import MOST_BELIEVED, Believed, RouteRequest, Sighted
 from swarm.wire.route_columns import Route, RouteStatus
@@ -28,23 +28,14 @@ classes = [{ name = "low", cost = { max_slope_deg = 15.0, vehicle_radius_m = 12.
 """
 
 
-class World(SwarmModel):
+class World(Planners):
     """The planner of an unseen target, and a client that asks."""
 
     def __init__(self) -> None:
         scenario = parse_scenario(_TEXT)
-        self.ground: Terrain = build_terrain(scenario)
-        super().__init__(terrain=self.ground, scenario=scenario)
-        self.ear = Ear(self)
-        self.generation = 0
-        self.service = self.restart()
-
-    def restart(self) -> PlannerService:
-        """A planner that knows nothing of the one before."""
-        self.generation += 1
-        plans = planning(self, "planner", "h", self.generation)
-        name = f"planner-h{self.generation}"
-        return self.start(name, lambda bus, post: PlannerService(plans(bus, post)), phase_ns=0)
+        self.ground = build_terrain(scenario)
+        super().__init__(self.ground, scenario)
+        self.service = self.planners["h"]
 
     def sight(self, author: str, age_s: int, cell: int) -> None:
         """Publishes a sighting of the target, under the name of this author."""
@@ -57,14 +48,8 @@ class World(SwarmModel):
 
     def route(self, vehicle: str, cell: int, vehicle_class: str = "ground") -> Route:
         """The answer for a vehicle."""
-        self.ear.ended.clear()
-        self.ear.replies.clear()
         request = RouteRequest(cells=[cell], vehicles=[vehicle], vehicle_class=vehicle_class)
-        self.ear.ask(ROUTE, request, target="h")
-        while not self.ear.ended:
-            self.run(0.1)
-        reply: Any = self.ear.replies[0]
-        return next(iter(reply.routes))
+        return next(iter(self.ear.answer(ROUTE, request, target="h").routes))
 
 
 def test_vehicles_of_different_classes_search_by_one_belief_each_on_its_own_ground_and_apart() -> None:
@@ -143,3 +128,20 @@ def test_a_class_is_answered_from_the_search_at_once_where_nobody_has_seen_the_t
     cell = int(np.flatnonzero(np.isfinite(world.ground.pace_s_per_m))[0])
     world.route("v0", cell, "low")
     assert world.now_ns - began_ns <= NS_PER_S // 5
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_arrivals_are_the_cheapest_ways_out_and_the_bound_of_large_maps_is_below(seed, monkeypatch):
+    chance = np.random.default_rng(seed)
+    pace = chance.uniform(0.02, 1.0, (24, 31)).astype(np.float32)
+    pace[chance.random(pace.shape) < 0.2] = np.inf
+    costs = loaded(pace, GridSpec(*pace.shape, 10.0), corner_cutting=True)
+    start = int(chance.choice(np.flatnonzero(np.isfinite(pace))))
+    # Ways out are ways in turned round, on which a step has the pace of the cell that it leaves.
+    exact = 10.0 * naive.cost_to_go(pace, start, corner_cutting=True, left_share=1.0)
+    ways = Ways(costs)
+    np.testing.assert_allclose(ways.arrivals_s(start), exact, rtol=1e-5)
+    monkeypatch.setattr("planner_service.target_search._MOST_CELLS", 0)
+    bound = ways.arrivals_s(start)
+    assert (bound <= exact * (1 + 1e-5)).all()
+    assert (np.isinf(bound) == np.isinf(exact)).all()

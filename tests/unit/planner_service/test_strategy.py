@@ -22,6 +22,7 @@ from swarm.grid import GridSpec, Window
 from swarm.plugins import Plugin
 
 GRID = GridSpec(96, 96, 1.0)
+row_of: Any = strategies.StrategyRow
 
 
 def kinds_of_moves(config: PlannerConfig, row: strategies.StrategyRow, moves: int) -> list[str]:
@@ -42,15 +43,12 @@ def test_every_strategy_of_the_scenario_has_a_row_and_every_row_a_name() -> None
 @pytest.mark.parametrize(
     ("row", "expected"),
     [
-        (strategies.StrategyRow(strategies.OnMove.WHOLE_TREE), ["full"] * 5),
-        (strategies.StrategyRow(strategies.OnMove.BLOCK_WINDOW), ["window"] * 5),
-        (strategies.StrategyRow(strategies.OnMove.BLOCK_WINDOW, thins_far_cells=True), ["window~"] * 5),
-        (strategies.StrategyRow(strategies.OnMove.SCHEDULED_WINDOW), ["window"] * 5),
-        (strategies.StrategyRow(strategies.OnMove.EXACT_MOVE), ["exact"] * 5),
-        (
-            strategies.StrategyRow(strategies.OnMove.SCHEDULED_WINDOW, renews_within_budget=True),
-            ["window", "window", "exact"] * 2,
-        ),
+        (row_of(strategies.OnMove.WHOLE_TREE), ["full"] * 5),
+        (row_of(strategies.OnMove.BLOCK_WINDOW), ["window"] * 5),
+        (row_of(strategies.OnMove.BLOCK_WINDOW, thins_far_cells=True), ["window~"] * 5),
+        (row_of(strategies.OnMove.SCHEDULED_WINDOW), ["window"] * 5),
+        (row_of(strategies.OnMove.EXACT_MOVE), ["exact"] * 5),
+        (row_of(strategies.OnMove.SCHEDULED_WINDOW, renews_within_budget=True), ["window", "window", "exact"] * 2),
     ],
 )
 def test_a_tree_does_what_its_row_says_whatever_the_strategy_is_called(row, expected):
@@ -145,11 +143,8 @@ def test_a_plugins_row_is_in_force() -> None:
         (lambda: 1 / 0, "raised ZeroDivisionError"),
         (None, "returned NoneType, expected a StrategyRow"),
         ("full", "returned str, expected a StrategyRow"),
-        (strategies.StrategyRow("whole tree"), "on_move is 'whole tree', expected a OnMove"),  # type: ignore[arg-type]
-        (
-            strategies.StrategyRow(strategies.OnMove.WHOLE_TREE, thins_far_cells=1),
-            "thins_far_cells is 1, expected a bool",
-        ),  # type: ignore[arg-type]
+        (row_of("whole tree"), "on_move is 'whole tree', expected a OnMove"),
+        (row_of(strategies.OnMove.WHOLE_TREE, thins_far_cells=1), "thins_far_cells is 1, expected a bool"),
     ],
 )
 def test_a_strategy_that_fails_is_named_and_trees_stay_exact(answer: object, said: str) -> None:
@@ -178,13 +173,18 @@ def test_growths_that_took_long_as_they_were_cut_up_do_not_leave_a_large_tree_to
     assert times.row.on_move is not strategies.OnMove.EXACT_MOVE
 
 
+def dear_tree(full_ns: int) -> GrowthTimes:
+    """Growths of such a time, and exact moves of three times what a tick may take."""
+    times = GrowthTimes(GridSpec(2048, 2048, 10.0), PlannerConfig(cpu_budget=0.1), True, False, None)
+    times.observe_full_ns(full_ns)
+    for _ in range(3):
+        times.observe_exact_ns(30_000_000)
+    return times
+
+
 def test_auto_keeps_a_dear_tree_exact_for_a_target_that_moves_seldom() -> None:
-    grid = GridSpec(2048, 2048, 10.0)
     for every, stage in ((20, strategies.OnMove.EXACT_MOVE), (1, strategies.OnMove.SCHEDULED_WINDOW)):
-        times = GrowthTimes(grid, PlannerConfig(cpu_budget=0.1), True, False, None)
-        times.observe_full_ns(150_000_000)
-        for _ in range(3):
-            times.observe_exact_ns(30_000_000)  # three times what a tick may take
+        times = dear_tree(150_000_000)
         for tick in range(200):
             times.note_tick(tick % every == 0)
         assert times.row.on_move is stage
@@ -209,7 +209,7 @@ def test_auto_takes_the_cheaper_of_a_growth_to_the_askers_and_an_exact_move_and_
 
 
 def large_tree(clock: Iterator[int] | None = None) -> tuple[TargetTree, np.ndarray, GridSpec]:
-    """A tree in pieces of a map which only a worker may grow again, and the paces that it was given."""
+    """An exact tree in pieces that only a worker may grow again, and the paces that it was given."""
     grid = GridSpec(512, 512, 1.0)
     stopwatch = (lambda: 0) if clock is None else clock.__next__
     tree = TargetTree(grid, PlannerConfig(cpu_budget=0.1), has_worker=True, stopwatch=stopwatch)
@@ -222,6 +222,13 @@ def large_tree(clock: Iterator[int] | None = None) -> tuple[TargetTree, np.ndarr
     return tree, pace, grid
 
 
+def leave_to_windows(tree: TargetTree) -> None:
+    """Exact moves take longer than a tick may."""
+    for _ in range(3):
+        tree.times.observe_exact_ns(300_000_000)
+    assert tree.strategy.on_move is strategies.OnMove.SCHEDULED_WINDOW
+
+
 def test_what_a_repair_took_is_not_taken_for_the_move_that_follows_it() -> None:
     tree, pace, grid = large_tree(itertools.count(0, 7))
     pace[200, 200] = 5.0
@@ -232,9 +239,7 @@ def test_what_a_repair_took_is_not_taken_for_the_move_that_follows_it() -> None:
 
 def test_a_large_tree_in_pieces_is_not_turned_into_one_with_all_costs_between_two_answers() -> None:
     tree, pace, grid = large_tree()
-    for _ in range(3):
-        tree.times.observe_exact_ns(300_000_000)
-    assert tree.strategy.on_move is strategies.OnMove.SCHEDULED_WINDOW
+    leave_to_windows(tree)
     update = tree.update(pace, grid.cell(100, 101), [], 0)
     assert (update.kind, update.cells, update.wants_full) == ("none", 0, True)
     assert (tree.ready, tree.target_cell) == (True, grid.cell(100, 100))  # and it says where it leads meanwhile
@@ -246,9 +251,7 @@ def test_a_large_tree_in_pieces_is_not_turned_into_one_with_all_costs_between_tw
 def test_a_tree_in_pieces_that_a_worker_brings_late_is_not_turned_into_one_with_all_costs(monkeypatch):
     tree, pace, grid = large_tree()
     grown = tree.full_job(grid.cell(100, 101))()  # asked for while the row in force was exact
-    for _ in range(3):
-        tree.times.observe_exact_ns(300_000_000)
-    assert tree.strategy.on_move is strategies.OnMove.SCHEDULED_WINDOW
+    leave_to_windows(tree)
     monkeypatch.setattr(partitioned_tree, "in_cells", lambda each: pytest.fail("turned into one with all costs"))
     update = tree.adopt(grown, pace, grid.cell(100, 102), [], 0, np.empty(0, np.int64))
     assert (tree.target_cell, update.wants_full) == (grid.cell(100, 101), True)
@@ -265,10 +268,7 @@ def test_work_and_the_rest_after_it_keep_to_the_share_of_a_core_whatever_the_tic
 
 
 def test_a_load_that_has_ended_brings_a_large_tree_back_to_exact_moves() -> None:
-    times = GrowthTimes(GridSpec(2048, 2048, 10.0), PlannerConfig(cpu_budget=0.1), True, False, None)
-    times.observe_full_ns(400_000_000)
-    for _ in range(3):
-        times.observe_exact_ns(30_000_000)
+    times = dear_tree(400_000_000)
     assert times.row.on_move is strategies.OnMove.SCHEDULED_WINDOW
     for _ in range(3):
         times.observe_full_ns(70_000_000)
@@ -278,8 +278,7 @@ def test_a_load_that_has_ended_brings_a_large_tree_back_to_exact_moves() -> None
 def test_windows_do_not_forget_that_vehicles_are_far_and_grow_no_tree_to_find_it_out() -> None:
     tree, pace, grid = large_tree()
     far = np.array([grid.cell(500, 500)])
-    for _ in range(3):
-        tree.times.observe_exact_ns(300_000_000)
+    leave_to_windows(tree)
     tree.adopt(tree.full_job(grid.cell(100, 101))(), pace, grid.cell(100, 101), [], 0, far)
     kinds = set()
     for n in range(80):

@@ -1,7 +1,5 @@
 """WindowSchedule and strides: growth near the target, and far from it."""
 
-import math
-
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -14,9 +12,10 @@ from support.planner_strategies import RULES, Job, Move, random_pace
 from planner_service import growth_times
 from planner_service.growth_times import GrowthTimes, WindowSchedule
 from planner_service.strategy import AHEAD, STAGES, Auto, Growths
+from planner_service.target_tree import TargetTree
 from planner_service.tree import strides
 from swarm.config.scenario import PlannerConfig
-from swarm.grid import GridSpec
+from swarm.grid import GridSpec, walk
 
 COARSE = ("multi_resolution", "variable_range+multi_resolution")
 
@@ -109,31 +108,23 @@ def test_auto_grows_exactly_then_rotates_and_does_not_flap() -> None:
     assert stages == ["exact", "exact", "rotate", "rotate", "rotate", "exact", "rotate", "rotate", "exact"]
 
 
-@pytest.mark.parametrize("rules", RULES)
-@pytest.mark.parametrize("length_weight", [0.0, 3.0])
-def test_each_cells_length_is_that_of_its_way(rules: dict, length_weight: float) -> None:
-    rng = np.random.default_rng(4)
-    pace = random_pace(rng, 18, 23, 10.0, 0.2)
-    play = Play(pace, PlannerConfig(strategy="full", length_weight=length_weight, **rules))
-    for route in play.tree.routes(np.arange(pace.size)):
-        if not math.isfinite(route.length_m):
-            assert not route.directions
-            continue
-        diagonal = math.sqrt(2) if rules["edge"] == "octile" and rules["neighbours"] == 8 else 1.0
-        steps = sum(diagonal if code & 1 else 1.0 for code in route.directions)
-        assert route.length_m == pytest.approx(steps, rel=1e-5)
-
-
-def test_a_dearer_length_makes_ways_shorter_and_slower() -> None:
-    pace = random_pace(np.random.default_rng(6), 30, 30, 20.0, 0.1)
-    found = {}
-    for weight in (0.0, 10.0):
-        play = Play(pace, PlannerConfig(strategy="full", length_weight=weight))
-        routes = play.tree.routes(np.arange(900))
-        lengths, costs = routes.length_m, routes.cost_s
-        found[weight] = float(lengths[np.isfinite(lengths)].sum()), float(costs[np.isfinite(costs)].sum())
-    assert found[10.0][0] < found[0.0][0]
-    assert found[10.0][1] > found[0.0][1]
+@pytest.mark.parametrize("length_weight", [0.0, 0.05, 0.5])
+def test_a_route_that_is_cut_has_the_travel_time_of_the_whole(length_weight: float) -> None:
+    grid, pace = GridSpec(30, 60, 10.0), random_pace(np.random.default_rng(1), 30, 60, 12.0, 0.0)
+    target, pace[3, 3] = grid.cell(15, 55), np.inf
+    tree = TargetTree(grid, PlannerConfig(strategy="full", length_weight=length_weight))
+    tree.update(pace, target, [], 1)
+    cells = [grid.cell(15, 3), grid.cell(2, 40), target, grid.cell(3, 3), -1]
+    whole, cut = tree.routes(cells), tree.routes(cells, 20)
+    for long, short in zip(whole, cut, strict=True):
+        assert long.status is short.status
+        assert len(short.directions) <= 20
+        np.testing.assert_allclose(short.cost_s, long.cost_s, rtol=1e-5)
+        np.testing.assert_allclose(short.gap, long.gap, rtol=1e-5)
+    assert cut[2].remaining_s == whole[2].remaining_s == 0.0
+    first = cut[0]
+    after = tree.routes([walk(grid, first.start, first.directions)[-1]])[0]
+    np.testing.assert_allclose(first.remaining_s, after.cost_s, rtol=1e-5)
 
 
 def test_on_a_large_map_a_forced_range_grows_as_far_as_the_vehicle_without_a_worker(monkeypatch):

@@ -54,24 +54,20 @@ def here() -> Watch:
     return Watch()
 
 
-def test_a_pose_outside_is_counted_said_once_and_not_used(here: Watch) -> None:
+@pytest.mark.parametrize(
+    ("place", "named"),
+    [({"cell": GRID.cells}, "cell 600"), ({"cell": CELL_OF_PLACE, "x_m": 1234.5, "y_m": 0.0}, "1234, 0 m")],
+)
+def test_a_pose_outside_is_counted_said_once_and_not_used(here, place, named):
     here.hear()
     for _ in range(5):
-        here.hear(cell=GRID.cells)
+        here.hear(**place)
         here.tick()
     assert here.sentences() == [
-        "target t0: tracker radar puts it into cell 600, outside of the terrain of 20 x 30 cells: not used"
+        f"target t0: tracker radar puts it into {named}, outside of the terrain of 20 x 30 cells: not used"
     ]
     assert here.counted() == {"poses_outside": 5}
     assert here.watch.pose.cell == GRID.cell(10, 20)
-
-
-def test_a_place_outside_without_a_cell_is_named_by_its_metres(here: Watch) -> None:
-    here.hear(cell=CELL_OF_PLACE, x_m=1234.5, y_m=0.0)
-    here.tick()
-    assert here.sentences() == [
-        "target t0: tracker radar puts it into 1234, 0 m, outside of the terrain of 20 x 30 cells: not used"
-    ]
 
 
 @pytest.mark.parametrize("off_s", [3600, -3600])

@@ -73,13 +73,15 @@ def test_at_the_start_all_planners_are_asked_once_for_all_vehicles(agent: Agent)
     assert agent.decide(S // 10) == []
 
 
-def test_one_request_per_target_and_tick_for_all_who_need_a_route(agent: Agent) -> None:
+def test_one_request_per_target_and_tick_for_all_who_need_a_route(agent):
     (asked,) = agent.decide(0)
     assert isinstance(asked, AskCosts)
     answer_costs(agent, asked, 0, t0=[5.0, 6.0], t1=[math.inf, math.inf])
     (routes,) = agent.decide(S // 10)
     cells = (GRID.cell(5, 5), GRID.cell(5, 7))
     assert routes == AskRoutes(2, "t0", ("a0-00", "a0-01"), cells, force=False, reroutes=0)
+    assert agent.routes_given(routes.request, route_reply(RouteBatch.of([]), GRID), S // 5) == []
+    assert len(agent.decide(S)) == 1
 
 
 def test_a_vehicle_that_finds_its_place_after_the_others_is_assigned_soon() -> None:
@@ -112,33 +114,27 @@ def test_once_all_living_planners_have_answered_the_end_of_a_question_is_not_wai
     assert agent.costs_given(asked.request, "t0", costs_s)
 
 
-def test_nobody_answering_is_asked_again_soon(agent: Agent) -> None:
+def test_who_gets_no_costs_that_count_asks_again_soon(agent: Agent) -> None:
+    """Not those of the wrong length, or of another request."""
     (asked,) = agent.decide(0)
+    agent.assignment.costs_given(asked.request, "t0", np.array([1.0], np.float32))
+    agent.assignment.costs_given(asked.request + 7, "t0", np.array([1.0, 1.0], np.float32))
     agent.costs_ended(asked.request, S)
+    assert {vehicle.target for vehicle in agent.vehicles.values()} == {None}
     assert agent.decide(S + S // 10) == []
     assert len(agent.decide(2 * S)) == 1
 
 
-def test_a_reply_too_short_for_its_request_makes_the_rest_ask_again(agent: Agent) -> None:
-    (asked,) = agent.decide(0)
-    assert isinstance(asked, AskCosts)
-    answer_costs(agent, asked, 0, t0=[5.0, 6.0])
-    (routes,) = agent.decide(S // 10)
-    assert agent.routes_given(routes.request, route_reply(RouteBatch.of([]), GRID), S // 5) == []
-    assert len(agent.decide(S)) == 1
-
-
-def test_costs_of_the_wrong_length_or_request_are_nobodys(agent: Agent) -> None:
-    (asked,) = agent.decide(0)
-    agent.assignment.costs_given(asked.request, "t0", np.array([1.0], np.float32))
-    agent.assignment.costs_given(asked.request + 7, "t0", np.array([1.0, 1.0], np.float32))
-    agent.costs_ended(asked.request, 0)
-    assert {vehicle.target for vehicle in agent.vehicles.values()} == {None}
+def close(agent: Agent, cell: int, now_ns: int) -> None:
+    """A cell is found lethal."""
+    agent._map = dataclasses.replace(agent._map, pace=LEVEL.copy())
+    agent._steering._pace = agent._map.pace.reshape(-1)
+    agent._steering._pace[cell] = np.inf
+    agent.map_changed([GRID.window], now_ns)
 
 
 def test_a_vehicle_drives_what_it_is_granted_and_gives_back_what_is_found_lethal() -> None:
-    scenario = parse_scenario(TEXT)
-    agent = agent_of(scenario)
+    agent = agent_of(parse_scenario(TEXT))
     here = GRID.cell(5, 5)
     grant(agent, 1, v0=[here], v1=[GRID.cell(8, 8)])
     grant(agent, 2, v0=[here, here + 1, here + 2, here + 3], v1=[GRID.cell(8, 8)])
@@ -147,10 +143,7 @@ def test_a_vehicle_drives_what_it_is_granted_and_gives_back_what_is_found_lethal
     while agent.drive() is not None:
         pass
     assert agent.vehicles["a0-00"].motion.head == here + 1
-    agent._map = dataclasses.replace(agent._map, pace=LEVEL.copy())
-    agent._steering._pace = agent._map.pace.reshape(-1)
-    agent._map.pace.reshape(-1)[here + 2] = np.inf
-    agent.map_changed([GRID.window], S)
+    close(agent, here + 2, S)
     assert here + 2 not in agent.holdings.path("a0-00")
     assert agent.holdings.path("a0-00")[-1] == here + 1
     assert [vehicle.cell for vehicle in agent.vehicles.values()][1] == GRID.cell(8, 8)
@@ -167,11 +160,7 @@ def test_a_corner_that_is_found_lethal_is_not_cut_though_the_cell_behind_it_is_g
     agent.begin_drive(S // 10)
     agent.drive()
     assert agent.vehicles["a0-00"].motion.head == behind
-    pace = LEVEL.copy()
-    pace.reshape(-1)[beside] = np.inf
-    agent._map = dataclasses.replace(agent._map, pace=pace)
-    agent._steering._pace = pace.reshape(-1)
-    agent.map_changed([GRID.window], S // 5)
+    close(agent, beside, S // 5)
     assert list(agent.holdings.path("a0-00")) == [here]
     agent.begin_drive(2 * S)
     while agent.drive() is not None:

@@ -3,6 +3,8 @@
 import random
 from collections.abc import Sequence
 
+import pytest
+
 from planner_service.followers import Followers
 from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec
@@ -28,24 +30,19 @@ def test_a_vehicle_tells_the_end_of_its_path_where_a_new_route_for_it_begins() -
     assert told(ChasersReport("all.a0.1"), *vehicles) == {"t0": {"v": 6}, "t1": {"w": 9}}
 
 
-def test_who_has_not_driven_past_the_cell_told_is_told_again_only_by_the_heartbeat() -> None:
+@pytest.mark.parametrize(
+    ("now", "at_once", "later"),
+    [
+        (("v", "t0", (6, 7, 8)), {}, {"t0": {"v": 8}}),  # it has not driven past the cell told
+        (("v", "t0", (7, 8)), {"t0": {"v": 8}}, {}),
+        (("v", "t1", (6,)), {"t0": {}, "t1": {"v": 6}}, {}),  # an empty target is told once
+    ],
+)
+def test_who_drives_past_the_cell_told_or_leaves_its_target_is_told_at_once(now, at_once, later):
     report = ChasersReport("a0.1")
     told(report, ("v", "t0", (4, 5, 6)))
-    assert told(report, ("v", "t0", (6, 7, 8)), at_ns=TICK_NS) == {}
-    assert told(report, ("v", "t0", (6, 7, 8)), at_ns=HEARTBEAT_NS) == {"t0": {"v": 8}}
-
-
-def test_who_has_driven_past_the_cell_told_is_told_again_at_once() -> None:
-    report = ChasersReport("a0.1")
-    told(report, ("v", "t0", (4, 5, 6)), ("w", "t1", (9,)))
-    assert told(report, ("v", "t0", (7, 8)), ("w", "t1", (9,)), at_ns=TICK_NS) == {"t0": {"v": 8}}
-
-
-def test_who_leaves_a_target_is_told_to_both_planners_at_once_and_an_empty_target_only_once() -> None:
-    report = ChasersReport("a0.1")
-    told(report, ("v", "t0", (4,)))
-    assert told(report, ("v", "t1", (4,)), at_ns=TICK_NS) == {"t0": {}, "t1": {"v": 4}}
-    assert told(report, ("v", "t1", (4,)), at_ns=HEARTBEAT_NS) == {}
+    assert told(report, now, at_ns=TICK_NS) == at_once
+    assert told(report, now, at_ns=HEARTBEAT_NS) == later
 
 
 def test_a_vehicle_that_is_sent_elsewhere_tells_its_new_place_at_once() -> None:

@@ -52,11 +52,6 @@ def drive(dynamics: PluginDynamics, motion: Motion, path: list[int], ticks: int)
     return places
 
 
-def test_what_is_built_in_costs_no_call() -> None:
-    named = NamedPlugin(PLUGIN_KINDS["dynamics"], "vehicles.dynamics", "ground", {})
-    assert dynamics_of(Plugin(named, None, None), DynamicsWorld("a0", GRID, 1), print) is None
-
-
 def test_a_vehicle_keeps_the_speed_that_it_is_told() -> None:
     dynamics, told, _ = driven_by(lambda stretch: 4.0)
     places = drive(dynamics, Motion(GRID, 0), list(range(20)), 100)
@@ -177,7 +172,9 @@ def test_a_class_brakes_to_a_stop_where_its_cells_end(accel: float) -> None:
     assert TICK_S * len(speeds) <= 1.2 * quickest + 10 * TICK_S
 
 
-def test_a_class_without_limits_of_its_own_has_no_dynamics() -> None:
+def test_what_drives_as_the_ground_allows_has_no_dynamics() -> None:
     world = DynamicsWorld("a0", GRID, 1)
+    named = NamedPlugin(PLUGIN_KINDS["dynamics"], "vehicles.dynamics", "ground", {})
+    assert dynamics_of(Plugin(named, None, None), world, print) is None
     assert own_dynamics(None, world) is None
     assert own_dynamics(ClassConfig(name="walker", max_speed_m_per_s=2.0), world) is None

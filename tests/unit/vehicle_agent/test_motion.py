@@ -82,3 +82,45 @@ def test_a_pulled_step_passes_the_border_where_its_own_line_does() -> None:
     east_m, south_m = motion.place_m()
     assert (east_m, south_m) == pytest.approx((30.0, 27.0))
     assert motion.length_m == pytest.approx(10.0 * math.hypot(1.0, 0.4))  # it has no bend
+
+
+def test_a_vehicle_occupies_the_cell_that_its_point_is_in() -> None:
+    motion = Motion(GRID, 6)
+    motion.set_out(7)
+    assert motion.advance(0.4, 0.1) == 0.0
+    assert (motion.cell, motion.entering, motion.place_m()) == (6, 7, (19.0, 15.0))
+    # One second a cell: the border after half of it, and there it stops to look around.
+    assert motion.advance(0.6, 0.1) == pytest.approx(0.5)
+    assert (motion.cell, motion.entering, motion.at_rest) == (7, None, False)
+    assert motion.advance(0.7, 0.1) == pytest.approx(0.2)
+    assert motion.at_rest
+    assert motion.place_m() == (25.0, 15.0)
+
+
+def test_a_diagonal_step_is_longer_and_heads_south_east() -> None:
+    motion = Motion(GRID, 6)
+    motion.set_out(12)
+    left_s = motion.advance(motion.advance(2.0, 0.1), 0.1)
+    assert left_s == pytest.approx(2.0 - math.sqrt(2.0))
+    assert motion.heading_rad == pytest.approx(0.75 * math.pi)
+
+
+def test_nobody_sets_out_for_a_cell_that_is_no_neighbour() -> None:
+    with pytest.raises(ValueError, match="no step"):
+        Motion(GRID, 9).set_out(10)
+
+
+@given(st.lists(st.floats(0.01, 0.3), min_size=30, max_size=30))
+def test_time_is_neither_lost_nor_won_by_cutting_it_up(slices: list[float]) -> None:
+    motion = Motion(GRID, 0)
+    spent_s, target = 0.0, 1
+    for seconds in slices:
+        left_s = seconds
+        while left_s > 0.0 and target < GRID.cols:
+            if motion.at_rest:
+                motion.set_out(target)
+            left_s = motion.advance(left_s, 0.1)
+            target += motion.at_rest
+        spent_s += seconds - left_s
+    east_m, _ = motion.place_m()
+    assert east_m == pytest.approx(5.0 + 10.0 * spent_s, abs=1e-3)

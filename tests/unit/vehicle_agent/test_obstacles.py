@@ -13,13 +13,16 @@ from shared_map.terrain.slope_and_climb import climb_of
 from swarm.clock import NS_PER_S
 from swarm.config.ground import CostConfig
 from swarm.config.scenario import PlannerConfig
+from swarm.config.toml_files import parse_scenario
+from swarm.errors import ConfigError
 from swarm.grid import GridSpec
 from swarm.right_of_way.holdings import Wish
+from swarm.wire.messages.planning import TargetPose
 from swarm.wire.messages.vehicles import Obstacle
 from vehicle_agent.driving.driven_vehicle import GivenRoute, Vehicle
 from vehicle_agent.traffic.detours import Detours
 from vehicle_agent.traffic.next_cells import Steering
-from vehicle_agent.traffic.obstacles import MOST_CELLS_OF_ONE, MOST_OBSTACLES, Obstacles
+from vehicle_agent.traffic.obstacles import MOST_CELLS_OF_ONE, MOST_OBSTACLES, Obstacles, TargetObstacles
 
 GRID = GridSpec(40, 40, 10.0)
 NOW = 10**18
@@ -261,3 +264,49 @@ def test_a_vehicle_at_rest_makes_way_for_an_obstacle_that_comes(obstacles: Obsta
     assert wish.better == len(wish.wants) == 8
     assert all(row != 20 for row, _ in (divmod(cell, 40) for cell in wish.wants[:2]))
     assert wish_at(GRID.cell(25, 13)).better == 0
+
+
+# --- targets as obstacles ---
+
+TEXT = """
+targets = [{{ name = "t", obstacle_radius_m = {radius} }}, {{ name = "soft" }}]
+vehicles = {{ capture_range_m = 30 }}
+"""
+
+
+def pose(col: float, target: str = "t", jumps: int = 0) -> TargetPose:
+    return TargetPose(
+        target=target, incarnation=1, seq=1, stamp_ns=0, cell=0, x_m=col * 10.0, y_m=-55.0, jumps=jumps
+    )
+
+
+@pytest.fixture
+def made() -> TargetObstacles:
+    return TargetObstacles(parse_scenario(TEXT.format(radius=2)), GRID)
+
+
+def test_a_target_closes_its_cell_and_those_that_it_drives_to(made, obstacles):
+    for number, col in enumerate((3.5, 4.5)):
+        (obstacle,) = made.obstacles_of(pose(col), NOW + number * NS_PER_S // 2)
+        obstacles.take_report(obstacle, NOW)
+    assert obstacle.heading_rad == pytest.approx(math.pi / 2)
+    assert obstacle.speed_m_per_s == pytest.approx(20.0)
+    assert closed(obstacles) == {(5, 4), (5, 5)}
+
+
+def test_a_captured_target_that_jumps_leaves_its_old_place_open_and_nobody_is_told_that_it_leaps(made, obstacles):
+    for number, (col, jumps) in enumerate(((3.5, 0), (15.5, 1))):
+        for obstacle in made.obstacles_of(pose(col, jumps=jumps), NOW + number * NS_PER_S // 5):
+            obstacles.take_report(obstacle, NOW + number * NS_PER_S // 5)
+    assert closed(obstacles) == {(5, 15)}
+    assert obstacles.complaints == []
+
+
+def test_a_target_without_a_radius_is_no_obstacle(made: TargetObstacles) -> None:
+    assert made.obstacles_of(pose(3.5, "soft"), NOW) == []
+
+
+def test_an_obstacle_that_leaves_no_cell_within_capture_range_is_refused() -> None:
+    scenario = parse_scenario(TEXT.format(radius=11))
+    with pytest.raises(ConfigError, match="capture_range_m is 30, expected at least 31"):
+        TargetObstacles(scenario, GRID)

@@ -69,12 +69,6 @@ def test_without_an_answer_it_asks_again_later_and_later(vehicle: Vehicle) -> No
     assert waits[:6] == [2, 4, 8, 16, 30, 30]
 
 
-def test_a_route_that_ran_out_is_asked_for_by_force(follower: Vehicle) -> None:
-    run_out(follower)
-    assert follower.route_request(2 * S) is Reason.RAN_OUT
-    assert follower.state is VehicleState.WAITING
-
-
 def test_with_its_target_in_reach_it_has_arrived_and_asks_nothing(follower: Vehicle) -> None:
     run_out(follower)
     follower.set_in_reach(True)
@@ -85,12 +79,6 @@ def test_with_its_target_in_reach_it_has_arrived_and_asks_nothing(follower: Vehi
     assert follower.route_request(4 * S) is Reason.RAN_OUT
 
 
-def test_a_route_given_in_parts_is_asked_for_before_it_ends(waiting: Vehicle) -> None:
-    waiting.give_route(GivenRoute("t0", (11, 12, 13), 9.0, 9.0, partial=True), [waiting.cell], S)
-    assert waiting.route_request(2 * S) is Reason.CONTINUED
-    assert not Reason.CONTINUED.is_reroute
-
-
 def test_a_pushed_route_replaces_the_old_one_from_here_on(follower: Vehicle) -> None:
     follower.motion.set_out(12)
     follower.motion.advance(100.0, 0.1)
@@ -98,12 +86,6 @@ def test_a_pushed_route_replaces_the_old_one_from_here_on(follower: Vehicle) -> 
     pushed = GivenRoute("t0", (11, 12, 22, 32), 3.0, 3.0, partial=False, pushed=True)
     followed = follower.give_route(pushed, [follower.cell], 2 * S)
     assert (cells_of(followed), followed.target, followed.cost_s) == ([12, 22, 32], "t0", 3.0)
-
-
-def test_a_pushed_route_that_does_not_pass_here_makes_it_stop_and_ask(follower: Vehicle) -> None:
-    pushed = GivenRoute("t0", (44, 45), 3.0, 3.0, partial=False, pushed=True)
-    assert follower.give_route(pushed, [follower.cell], 2 * S) is None
-    assert follower.route_request(3 * S) is Reason.ASSIGNED
 
 
 def test_a_route_to_another_target_is_ignored(follower: Vehicle) -> None:
@@ -152,32 +134,35 @@ def test_a_planner_that_has_not_seen_the_target_yet_is_asked_again(waiting: Vehi
     assert waiting.route_request(2 * S) is not None
 
 
+def pushed(*cells: int, partial: bool = False) -> Callable[[Vehicle], object]:
+    route = GivenRoute("t0", cells, 3.0, 3.0, partial, pushed=True)
+    return lambda vehicle: vehicle.give_route(route, [vehicle.cell], 2 * S)
+
+
 @pytest.mark.parametrize(
-    ("happen", "reason"),
+    ("happen", "reason", "left"),
     [
-        (Vehicle.blocked_for_long, Reason.BLOCKED),
-        (Vehicle.cut_route, Reason.CUT),
-        (Vehicle.target_jumped, Reason.JUMPED),
+        (lambda vehicle: vehicle.blocked_for_long(2 * S), Reason.BLOCKED, 3),
+        (lambda vehicle: vehicle.cut_route(2 * S), Reason.CUT, 3),
+        (lambda vehicle: vehicle.target_jumped(2 * S), Reason.JUMPED, 3),
+        (pushed(11, 12, 13, partial=True), Reason.CONTINUED, 2),  # before it ends
+        (pushed(44, 45), Reason.ASSIGNED, 0),  # which does not pass here: it stops
+        (run_out, Reason.RAN_OUT, 0),
     ],
 )
-def test_whoever_needs_another_route_asks_and_drives_its_own_on(follower, happen, reason):
-    happen(follower, 2 * S)
+def test_whoever_needs_another_route_asks_and_drives_on_what_it_has(follower, happen, reason, left):
+    happen(follower)
     assert follower.route_request(3 * S) is reason
-    assert (follower.route.left, follower.state) == (3, VehicleState.FOLLOWING)
+    state = VehicleState.FOLLOWING if left else VehicleState.WAITING
+    assert (follower.route.left, follower.state) == (left, state)
+    assert not Reason.CONTINUED.is_reroute
 
 
 def random_call(vehicle: Vehicle, chance: random.Random) -> None:
     """One thing happens to a vehicle that its agent may let happen."""
     target, asked, flag = vehicle.target, vehicle.asked, chance.random() < 0.5
-    route = GivenRoute(
-        chance.choice("ab"),
-        chance.choice([(11, 12, 13), (50, 51), (11,)]),
-        1.0,
-        1.0,
-        False,
-        flag,
-        chance.random() < 0.3,
-    )
+    to, cells = chance.choice("ab"), chance.choice([(11, 12, 13), (50, 51), (11,)])
+    route = GivenRoute(to, cells, 1.0, 1.0, False, flag, chance.random() < 0.3)
     status = chance.choice([RouteStatus.UNREACHABLE, RouteStatus.NO_TARGET])
     calls: list[tuple[bool, Callable[[], object]]] = [
         (True, lambda: vehicle.assign(chance.choice("ab"), 0)),
