@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,9 +16,18 @@ from shared_map.terrain.slope_and_climb import Climb, may_be_pulled
 from swarm.config.scenario import PlannerConfig
 from swarm.wire.route_columns import RouteBatch
 
-Pulled = tuple[NDArray[np.uint8], NDArray[np.int64], NDArray[np.uint32]]
-"""Routes along the cells that their segments cross: (directions of all, one route after the other; where each stops
-in them; over how many steps each segment goes)."""
+
+class Pulled(NamedTuple):
+    """Routes along the cells that their segments cross.
+
+    directions  uint8   of all routes, one after the other
+    ends        int64   (n,): where each stops in them
+    legs        uint32  over how many steps each segment goes
+    """
+
+    directions: NDArray[np.uint8]
+    ends: NDArray[np.int64]
+    legs: NDArray[np.uint32]
 
 
 def pulls(config: PlannerConfig, climb: Climb | None) -> bool:
@@ -70,7 +80,7 @@ class Puller:
             done = int(out[1][-1]) if many else 0
             returns = self._returns(starts, out[0][:done], out[1]) & ~stays
             if not returns.any():
-                return (out[0][:done], out[1], legs[: turned[0]]), prices * self._metres
+                return Pulled(out[0][:done], out[1], legs[: turned[0]]), prices * self._metres
             stays |= returns
 
     def _returns(
@@ -91,9 +101,9 @@ class Puller:
         """The same routes along their segments. Costs and bounds stay those of the routes over neighbours."""
         if not routes.directions.size:
             return routes
-        (directions, ends, legs), prices = self.pull(routes.starts, routes.directions, routes.ends)
+        pulled, prices = self.pull(routes.starts, routes.directions, routes.ends)
         length_m = np.where(np.isfinite(prices[0]), prices[2], routes.length_m)
-        return replace(routes, directions=directions, ends=ends, legs=legs, length_m=length_m)
+        return replace(routes, **pulled._asdict(), length_m=length_m)
 
 
 def _flight(climb: Climb) -> tuple[Floats, Floats, Floats, tuple[float, float]]:

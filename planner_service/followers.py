@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -80,8 +81,13 @@ class _Told:
     heard_ns: int
 
 
-Batch = tuple[int | None, int]
-"""Followers whose routes are read together: (goal, cells of a route)."""
+class Batch(NamedTuple):
+    """Followers whose routes are read together: to one goal, of as many cells."""
+
+    goal: int | None
+    max_cells: int
+
+
 _WORTH_PUSHING = (RouteStatus.OK, RouteStatus.UNREACHABLE)
 """A vehicle wants to know of a way, and that there is none any more."""
 CAPACITY = 4096
@@ -230,7 +236,7 @@ class Followers:
         batches: dict[Batch, list[tuple[str, Follower]]] = {}
         for id, follower in due:
             follower.stale = False
-            batches.setdefault((follower.goal, follower.max_cells), []).append((id, follower))
+            batches.setdefault(Batch(follower.goal, follower.max_cells), []).append((id, follower))
         return batches
 
     def pushed(
