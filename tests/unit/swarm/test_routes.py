@@ -30,8 +30,11 @@ from swarm.wire.route_columns import (
 )
 
 
-@given(st.lists(routes, max_size=6))
-def test_routes_come_off_the_wire_as_they_were(some: list[Route]) -> None:
+@given(st.lists(routes, max_size=6), st.booleans())
+def test_routes_come_off_the_wire_as_they_were(drawn: list[Route], pulled: bool) -> None:
+    """All routes of a batch have legs, or none has."""
+    legs = (route.legs or b"\1\0\0\0" * len(route.directions) if pulled else b"" for route in drawn)
+    some = [msgspec.structs.replace(route, legs=each) for route, each in zip(drawn, legs, strict=True)]
     batch = RouteBatch.of(some)
     assert list(batch) == some
     reply = decode(encode(route_reply(batch)), RouteReply)
