@@ -275,7 +275,7 @@ def _read(path: Path) -> None:
 @pytest.mark.parametrize("name", SEEDS)
 @settings(max_examples=few(150), deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(data=st.data())
-def test_flipped_cut_and_mixed_files_are_read_or_refused_in_one_line(
+def test_flipped_cut_and_mixed_files_are_read_or_refused_in_a_line_per_fault(
     tmp_path: Path, name: str, data: st.DataObject
 ) -> None:
     content = bytearray(SEEDS[name])
@@ -290,13 +290,13 @@ def test_flipped_cut_and_mixed_files_are_read_or_refused_in_one_line(
     path = tmp_path / name
     path.write_bytes(content)
     before_mb = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss >> 10
-    said = ""
+    faults: list[str] = []
     try:
         _read(path)
     except SwarmError as refused:
-        said = str(refused)
-    assert "\n" not in said
-    assert len(said) < 1000
+        faults = str(refused).split("\n")
+    assert len(faults) <= 1 or (name == "a.toml" and all(each.startswith(str(path)) for each in faults))
+    assert all(len(each) < 1000 for each in faults)
     assert (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss >> 10) - before_mb < MOST_MB
 
 
