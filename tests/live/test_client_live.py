@@ -177,14 +177,15 @@ def test_a_vehicle_with_right_of_way_reserves_its_way_and_is_let_in_cell_by_cell
     file = tmp_path / "guest.lives"
     problems: list[str] = []
     swarm.on_problem(problems.append)
-    with swarm.vehicle("guest", radius_m=3.0, right_of_way=file) as external:
+    with swarm.observer() as watching, swarm.vehicle("guest", radius_m=3.0, right_of_way=file) as external:
         with connect(live.endpoint) as again, pytest.raises(SwarmError, match="in use"):
             again.vehicle("guest", right_of_way=file)
         external.at(*swarm.frame.centre_m(swarm.frame.grid.cell(40, 60)))
         cells = list(external.route("t0").cells)
         for here, there in pairwise(cells[:12]):
             reserved = external.reserve(cells[cells.index(here) + 1 :][:4], timeout_s=20.0)
-            assert there in reserved, f"not let into {there}: {problems}"
+            others = {id: swarm.frame.cell(each.x_m, each.y_m) for id, each in watching.vehicles.items()}
+            assert there in reserved, f"not let into {there}: {problems}, {reserved}, others are in {others}"
             assert external.may_enter(there)
             external.at(*swarm.frame.centre_m(there))
         assert not external.may_enter(cells[0]), "it has been given back"
