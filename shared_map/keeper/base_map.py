@@ -55,6 +55,7 @@ LAYERS = {
 _PIECES_KEPT = 1024
 """Packed pieces that a keeper keeps, at most 64 MiB: machines often start together."""
 _LONGEST_WAIT_S = 3600.0
+"""Time after which the thread that waits for questions looks again: any, as a question wakes it."""
 _PIECES_PER_REQUEST = 64
 """Pieces of at most 64 KiB each: the largest cost of one reply to a keeper."""
 
