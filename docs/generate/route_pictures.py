@@ -19,7 +19,7 @@ from launch_scripts.observe.palette import BLUE, INK, ORANGE, hillshade
 from planner_service.route_finder import RouteFinder
 from shared_map.terrain.terrain import build_terrain
 from shared_map.vehicle_class_grounds import class_terrains
-from swarm.config.toml_files import load_scenario
+from swarm.config.scenario_files import load_scenario
 from swarm.config.vehicle_classes import WindConfig
 
 _SCENARIOS = Path(__file__).parents[2] / "launch_scripts" / "scenarios"

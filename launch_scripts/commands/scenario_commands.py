@@ -76,7 +76,7 @@ def new(file: Annotated[Path, typer.Argument(metavar="FILE")], choices: Choices)
         raise ConfigError(f"{file} is there already and stays as it is; choose another name, or remove it first")
     if not file.absolute().parent.is_dir():
         raise ConfigError(f"{file}: there is no folder {file.parent}; make it first")
-    from swarm.config.toml_files import commented
+    from swarm.config.scenario_files import commented
 
     text = commented(_settings(file, choices), _HEAD.format(name=file))
     _check(file, text)
@@ -87,7 +87,7 @@ def new(file: Annotated[Path, typer.Argument(metavar="FILE")], choices: Choices)
 def _check(path: Path, text: str) -> None:
     """Raises ConfigError where something chosen is not possible, by the option's name."""
     from launch_scripts.check import scenario_check
-    from swarm.config.toml_files import read_scenario
+    from swarm.config.scenario_files import read_scenario
 
     scenario, faults, _ = read_scenario(text, str(path), path.parent)
     if scenario is not None:
@@ -137,7 +137,7 @@ def _settings(path: Path, chosen: Choices) -> dict[str, Any]:
 
 def _from(path: Path, name: str) -> str:
     """A file as it is named from the folder of the scenario."""
-    from swarm.config.toml_files import BUILT_IN_TERRAINS
+    from swarm.config.scenario_files import BUILT_IN_TERRAINS
 
     if name in BUILT_IN_TERRAINS or Path(name).is_absolute():
         return name

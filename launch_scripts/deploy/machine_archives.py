@@ -44,7 +44,7 @@ from swarm.config.plugin_names import plugins_of
 from swarm.config.revocations import FILE as REVOKED
 from swarm.config.revocations import revoked_in
 from swarm.config.scenario import UNTIL_STOPPED_S, NetworkConfig, Scenario, TlsConfig
-from swarm.config.toml_files import scenario_text, with_files
+from swarm.config.scenario_files import scenario_text, with_files
 from swarm.errors import ConfigError, StoreError
 from swarm.files import write_file, writing
 from swarm.wire.codec import MAX_PAYLOAD_BYTES

@@ -29,7 +29,7 @@ import psutil
 
 from swarm.config.input_files import FileKind, read_text
 from swarm.config.scenario import Scenario
-from swarm.config.toml_files import scenario_text
+from swarm.config.scenario_files import scenario_text
 from swarm.errors import ConfigError, StoreError, SwarmError
 from swarm.files import check_writable, make_folder, write_file
 from swarm.runtime.run_secret import state_folder

@@ -19,7 +19,7 @@ from shared_map.terrain.store import load_terrain, load_truth
 from shared_map.terrain.terrain import Terrain
 from shared_map.vehicle_class_grounds import load_classes
 from swarm.config.scenario import Scenario
-from swarm.config.toml_files import parse_scenario
+from swarm.config.scenario_files import parse_scenario
 from swarm.errors import ConfigError, StoreError, SwarmError, TerrainError
 from swarm.recording.record_inputs import versions
 from swarm.recording.recording_file import FOLDER, SUFFIX, Head, RecordReader

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from shared_map.terrain.terrain import Terrain, build_terrain, terrain_of_pace
 from swarm.config.scenario import RoverConfig, Scenario
-from swarm.config.toml_files import parse_scenario
+from swarm.config.scenario_files import parse_scenario
 
 CROWDS = ("open", "doors", "corridor", "maze")
 

@@ -42,8 +42,8 @@ from launch_scripts.simulation.trials import (
 from swarm.config.explain import choice, converted
 from swarm.config.input_files import FileKind, parse_toml, quoted, read_text
 from swarm.config.scenario import Scenario
+from swarm.config.scenario_files import flat, parse_scenario
 from swarm.config.setting_types import Name, Options, Positive, Section
-from swarm.config.toml_files import flat, parse_scenario
 from swarm.errors import ConfigError
 
 MOST_TRIALS = 1_000_000

@@ -24,7 +24,7 @@ from distributed.client import FutureCancelledError
 
 from launch_scripts.simulation.study import Case, Summary, load_study, name_of, plan, summarise
 from launch_scripts.simulation.trials import Result, Trial, run_trial
-from swarm.config.toml_files import scenario_text
+from swarm.config.scenario_files import scenario_text
 from swarm.errors import BusError, StoreError
 from swarm.files import check_writable, make_folder, write_file, writing
 from swarm.journal import digest_of

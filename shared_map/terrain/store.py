@@ -34,7 +34,7 @@ from shared_map.terrain.zones import files_of_zone
 from swarm.config.input_files import FileKind, read_text
 from swarm.config.plugin_names import cost_layers_of
 from swarm.config.scenario import Scenario
-from swarm.config.toml_files import BUILT_IN_TERRAINS
+from swarm.config.scenario_files import BUILT_IN_TERRAINS
 from swarm.errors import StoreError, SwarmError, TerrainError
 from swarm.files import write_file, writing
 from swarm.grid import GridSpec

@@ -8,7 +8,7 @@ from __future__ import annotations
 import csv
 import math
 import tomllib
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -63,8 +63,6 @@ def cost_of_preset(name: str | None) -> CostConfig:
 
 _SLOPES = ("slope_deg", "slope_percent")
 _VALUES = ("factor", "pace_s_per_m", "speed_m_per_s")
-_LEVEL_TOLERANCE = 1e-3
-"""A table in three decimals may state 0.999 for flat ground; larger deviations are mistakes."""
 
 
 def with_slope_csv(cost: CostConfig, where: str, base: Path | None) -> CostConfig:
@@ -113,49 +111,6 @@ def read_slope_table(path: Path, flat_speed_m_per_s: float) -> tuple[tuple[float
                 " degrees and a pace of 0.01 to 100 times the flat one"
             ) from error
     return tuple(points)
-
-
-Fault = tuple[tuple[str, ...], str]
-"""Keys of a scenario that contradict each other, and the sentence about them."""
-
-
-def cost_faults(cost: CostConfig, where: str) -> Iterator[Fault]:
-    """Yields contradictions between individually valid settings of a cost, which stands under the key `where`."""
-
-    def keys(*names: str) -> tuple[str, ...]:
-        return tuple(f"{where}.{name}" for name in names)
-
-    table = keys("slope_table", "slope_csv")
-    if bool(cost.slope_table) != (cost.slope_rule == "table"):
-        needs = (
-            "needs slope_table or slope_csv" if cost.slope_rule == "table" else "reads no slope_table or slope_csv"
-        )
-        yield (*table, *keys("slope_rule", "preset")), f'{where}: slope_rule = "{cost.slope_rule}" {needs}'
-    yield from ((table, f"{where}.slope_table: {each}") for each in _table_faults(cost))
-    top, flat = cost.top_speed_m_per_s, cost.flat_speed_m_per_s
-    if top is not None and top < flat:
-        said = f"{where}.top_speed_m_per_s: {top:g} is less than flat_speed_m_per_s = {flat:g}"
-        yield keys("top_speed_m_per_s", "flat_speed_m_per_s", "preset"), said
-    for key in ("max_climb_deg", "max_descent_deg"):
-        if getattr(cost, key) is not None and not cost.directional:
-            said = f"{where}.{key} limits single steps: set directional = true, or use max_slope_deg"
-            yield keys(key, "directional", "preset"), said
-
-
-def _table_faults(cost: CostConfig) -> Iterator[str]:
-    points = cost.slope_table
-    if not points:
-        return
-    for (slope, _), (following, _) in pairwise(points):
-        if following <= slope:
-            yield f"{following:g} degrees come after {slope:g}, expected rising slopes"
-            return
-    level = factor_at(points, 0.0)
-    if abs(level - 1) > _LEVEL_TOLERANCE:
-        yield (
-            f"level ground takes {level:g} times the flat pace, expected 1: the speed on level ground"
-            f" is set by flat_speed_m_per_s = {cost.flat_speed_m_per_s:g}"
-        )
 
 
 def factor_at(points: tuple[tuple[float, float], ...], slope_deg: float) -> float:
@@ -247,42 +202,6 @@ def complete_costs(raw: dict[str, Any]) -> dict[str, Any]:
             if isinstance(each, dict) and isinstance(own := each.get("cost", {}), dict):
                 each["cost"] = whole_cost(common, own)
     return raw
-
-
-def class_faults(scenario: Scenario) -> Iterator[Fault]:
-    """Yields the faults of a scenario's classes, without those that `[cost]` has, too."""
-    names = [each.name for each in scenario.classes]
-    if GROUND in names:
-        said = f"classes: {GROUND!r} is the class of [cost] and [vehicles] itself; choose another name"
-        yield ("classes.name",), said
-    held = {fault for _, fault in cost_faults(scenario.cost, "cost")}
-    for n, each in enumerate(scenario.classes):
-        where = f"classes[{n}]"
-        for key in SHARED:
-            if getattr(each.cost, key) != getattr(scenario.cost, key):
-                said = f"{where}.cost.{key} is for all classes alike: give it in [cost] instead"
-                yield (f"{where}.cost.{key}", f"cost.{key}"), said
-        for keys, fault in cost_faults(each.cost, f"{where}.cost"):
-            if fault.removeprefix(f"{where}.") not in held:
-                yield (*keys, "cost"), fault
-        if each.air is not None and not scenario.wind.speed_m_per_s < each.air.speed_m_per_s:
-            key, wind = f"{where}.air.speed_m_per_s", scenario.wind.speed_m_per_s
-            said = (
-                f"{key}: found {each.air.speed_m_per_s:g}, expected more than wind.speed_m_per_s = {wind:g}:"
-                f" {each.name} could not fly against it"
-            )
-            yield (key, "wind.speed_m_per_s"), said
-        for k, zone in enumerate(each.air.no_fly if each.air is not None else ()):
-            drawn = zone.polygon is not None or zone.polygon_m is not None
-            if zone.kind != "forbidden" or not drawn or zone.file is not None or zone.mask is not None:
-                key, lacks = f"{where}.air.no_fly[{k}]", "" if drawn else " and no polygon"
-                said = f'{key}: expected kind = "forbidden" and a polygon, found kind {zone.kind!r}{lacks}'
-                yield (key,), said
-    for n, group in enumerate(scenario.groups):
-        if group.vehicle_class not in (GROUND, *names):
-            known = choice(group.vehicle_class, [GROUND, *names], " there are ")
-            said = f"groups: {group.name}: class is {group.vehicle_class!r}, which is no class{known}"
-            yield (f"groups[{n}].class", "classes.name"), said
 
 
 def driven_classes(scenario: Scenario) -> list[str]:

@@ -14,7 +14,7 @@ from typing import Any, TypeVar
 from swarm.bus.bus import Asked, Bus, Event, Post, WorkDone, Worker
 from swarm.bus.zenoh_bus import open_bus
 from swarm.clock import NS_PER_S, MonotonicClock
-from swarm.config.toml_files import scenario_text
+from swarm.config.scenario_files import scenario_text
 from swarm.errors import StoreError
 from swarm.recording import recording_file
 from swarm.recording.service_boundary import Boundary, Crossing, content_of, pack

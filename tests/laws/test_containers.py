@@ -30,7 +30,7 @@ from launch_scripts.deploy.machine_archives import (
 )
 from launch_scripts.deploy.machine_plan import Plan
 from launch_scripts.process_table import TABLE
-from swarm.config.toml_files import parse_scenario
+from swarm.config.scenario_files import parse_scenario
 
 LABEL = re.compile(r"[a-z0-9]([a-z0-9-]{0,61}[a-z0-9])?")
 EXAMPLE = Path(__file__).parents[2] / "docs" / "examples" / "kubernetes" / "swarm.yaml"

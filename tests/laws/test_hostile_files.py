@@ -24,7 +24,7 @@ from shared_map.importers.cover.classify import read_labels
 from shared_map.importers.terrain_sources import load_source
 from swarm.config.ground import TerrainConfig
 from swarm.config.input_files import parse_toml
-from swarm.config.toml_files import load_scenario
+from swarm.config.scenario_files import load_scenario
 from swarm.errors import ConfigError, SwarmError
 from swarm.grid import GridSpec
 

@@ -33,7 +33,7 @@ from shared_map.terrain.true_ground import build_truth
 from swarm.bus.bus import Event, Replied
 from swarm.bus.scheduler import InlineWorker
 from swarm.config.scenario import Scenario, plan_agents
-from swarm.config.toml_files import parse_scenario
+from swarm.config.scenario_files import parse_scenario
 from swarm.errors import ProtocolError
 from swarm.peers import Peer
 from swarm.right_of_way.promise_store import PromiseStore

@@ -13,7 +13,7 @@ from support.shard_tables import granted_cells, holdings_of
 
 from swarm.clock import NS_PER_S
 from swarm.config.scenario import plan_agents
-from swarm.config.toml_files import parse_scenario
+from swarm.config.scenario_files import parse_scenario
 from swarm.grid import GridSpec
 from swarm.right_of_way.shards import Shards
 from swarm.wire.messages.vehicles import Obstacle

@@ -18,7 +18,7 @@ from support.map_strategies import set_of
 from shared_map.keeper.mark_store import KeeperStore
 from shared_map.terrain.store import load_homes, load_terrain, load_truth, prepare
 from shared_map.vehicle_class_grounds import class_grounds, load_classes, prepare_classes
-from swarm.config.toml_files import parse_scenario
+from swarm.config.scenario_files import parse_scenario
 from swarm.errors import SwarmError
 from swarm.grid import GridSpec
 from swarm.right_of_way.generations import GenerationFile

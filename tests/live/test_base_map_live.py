@@ -13,7 +13,7 @@ from support.height_models import written
 from support.live_swarm import Hands, swarm, write_scenario
 from support.processes import eventually
 
-from swarm.config.toml_files import load_scenario
+from swarm.config.scenario_files import load_scenario
 from swarm.wire.route_columns import RouteStatus
 
 pytestmark = [pytest.mark.network, pytest.mark.slow]

@@ -22,7 +22,7 @@ from launch_scripts.ports import free_ports
 from swarm.bus.bus import Asked, Event, Heard
 from swarm.bus.zenoh_bus import ZenohBus, open_bus
 from swarm.client import BusError, connect
-from swarm.config.toml_files import load_scenario
+from swarm.config.scenario_files import load_scenario
 from swarm.grid import GridSpec
 from swarm.wire.messages import WIRE_VERSION
 from swarm.wire.messages.processes import Stats

@@ -25,7 +25,7 @@ from swarm.bus.bus import Event, Heard
 from swarm.bus.endpoints import listening
 from swarm.bus.zenoh_bus import ZenohBus
 from swarm.config.scenario import NetworkConfig
-from swarm.config.toml_files import load_scenario
+from swarm.config.scenario_files import load_scenario
 from swarm.wire.messages.processes import Stats
 from swarm.wire.messages.vehicles import Fleet, VehicleState
 from swarm.wire.topics import FLEET, STATS

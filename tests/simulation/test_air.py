@@ -11,7 +11,7 @@ from support.simulated import OrderedSimulation, agents, captures_by_class, cell
 from launch_scripts.simulation.laws import LawBook
 from launch_scripts.simulation.simulate import Node
 from shared_map.vehicle_class_grounds import class_grounds, clearance_floor
-from swarm.config.toml_files import parse_scenario
+from swarm.config.scenario_files import parse_scenario
 from swarm.wire.messages.orders import ZoneOrder
 
 SECONDS = 12.0

@@ -16,7 +16,7 @@ from shared_map.array_files import Bools
 from shared_map.keeper.zone_orders import zones_of
 from shared_map.vehicle_class_grounds import ClassGround, class_grounds
 from swarm.config.scenario import added_agent
-from swarm.config.toml_files import parse_scenario
+from swarm.config.scenario_files import parse_scenario
 from swarm.config.vehicle_classes import ClassConfig, class_numbers
 from swarm.errors import ConfigError
 from swarm.wire.messages.orders import ZoneOrder

@@ -25,7 +25,7 @@ from shared_map.terrain.terrain import terrain_of_pace
 from swarm.bus.bus import Event
 from swarm.clock import NS_PER_S
 from swarm.config.scenario import RoverConfig, Scenario, StandbyConfig, added_agent
-from swarm.config.toml_files import parse_scenario
+from swarm.config.scenario_files import parse_scenario
 from swarm.runtime.role_setup import RoleSetup
 from swarm.wire.messages.orders import GiveOrder, ZoneOrder
 

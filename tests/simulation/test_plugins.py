@@ -13,7 +13,7 @@ from support.simulated import simulate
 from launch_scripts.simulation.simulate import Simulation
 from launch_scripts.simulation.trials import Trial, run_trial
 from swarm.config.plugin_names import PLUGIN_KINDS
-from swarm.config.toml_files import load_scenario
+from swarm.config.scenario_files import load_scenario
 from swarm.wire.messages.processes import Note
 
 SECONDS = 10.0

@@ -7,7 +7,7 @@ import msgspec
 from launch_scripts.simulation.laws import LawBook
 from launch_scripts.simulation.simulate import Simulation
 from shared_map.terrain.terrain import build_terrain
-from swarm.config.toml_files import parse_scenario
+from swarm.config.scenario_files import parse_scenario
 from vehicle_agent.service import AgentService
 
 SECONDS = 12.0

@@ -12,7 +12,7 @@ from launch_scripts.simulation.simulate import Node, Simulation
 from planner_service.service import PlannerService
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.clock import NS_PER_S
-from swarm.config.toml_files import parse_scenario
+from swarm.config.scenario_files import parse_scenario
 from swarm.wire.messages.planning import Sighted
 from swarm.wire.messages.vehicles import VehicleState
 from vehicle_agent.service import AgentService

@@ -18,7 +18,7 @@ from swarm.bus.bus import Asked, Event, Heard
 from swarm.bus.memory_bus import LinkModel
 from swarm.clock import NS_PER_S
 from swarm.config.scenario import AgentPlan, PlannerConfig, plan_agents
-from swarm.config.toml_files import parse_scenario
+from swarm.config.scenario_files import parse_scenario
 from swarm.peers import Peer
 from swarm.right_of_way.promise_store import PromiseStore
 from swarm.wire.fields import column

@@ -16,7 +16,7 @@ from launch_scripts.simulation.simulate import Simulation
 from shared_map.array_files import Floats
 from shared_map.terrain.terrain import Terrain, terrain_of_pace
 from swarm.config.scenario import Scenario
-from swarm.config.toml_files import parse_scenario, scenario_text
+from swarm.config.scenario_files import parse_scenario, scenario_text
 from swarm.grid import GridSpec
 from swarm.peers import Peer
 from swarm.wire.messages import Message

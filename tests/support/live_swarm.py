@@ -19,7 +19,7 @@ from launch_scripts.ports import free_ports
 from swarm.bus.bus import AskEnded, Replied
 from swarm.bus.zenoh_bus import ZenohBus, open_bus
 from swarm.config.scenario import NetworkConfig, Scenario
-from swarm.config.toml_files import load_scenario
+from swarm.config.scenario_files import load_scenario
 from swarm.runtime.inbox import Inbox
 from swarm.wire.messages import Message, Nothing
 from swarm.wire.messages.planning import RouteRequest

@@ -21,7 +21,7 @@ from launch_scripts.process_table import LAUNCHER
 from swarm.bus.bus import Event, Heard, Replied
 from swarm.bus.zenoh_bus import ZenohBus, open_bus
 from swarm.config.scenario import TlsConfig
-from swarm.config.toml_files import load_scenario
+from swarm.config.scenario_files import load_scenario
 from swarm.runtime.inbox import Inbox
 from swarm.wire.messages.map_data import DIGEST_ROW, Digest, is_keeper
 from swarm.wire.messages.planning import PushedRoute, RouteReply, RouteRequest

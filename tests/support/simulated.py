@@ -19,7 +19,7 @@ from shared_map.terrain.terrain import Terrain, build_terrain
 from swarm.bus.bus import AskEnded, Event, Replied
 from swarm.clock import NS_PER_S
 from swarm.config.scenario import AddedAgent, Scenario, agent_of, plan_agents
-from swarm.config.toml_files import parse_scenario
+from swarm.config.scenario_files import parse_scenario
 from swarm.peers import ranked_id
 from swarm.right_of_way.external_session import ExternalService
 from swarm.right_of_way.generations import MemoryGenerations

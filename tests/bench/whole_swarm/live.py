@@ -25,7 +25,7 @@ from swarm.bus.bus import Heard
 from swarm.bus.endpoints import listening
 from swarm.bus.zenoh_bus import ZenohBus, open_bus
 from swarm.config.scenario import NetworkConfig, Scenario
-from swarm.config.toml_files import parse_scenario
+from swarm.config.scenario_files import parse_scenario
 from swarm.errors import BusError
 from swarm.runtime.inbox import Inbox
 from swarm.wire.fields import column

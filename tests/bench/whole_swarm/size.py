@@ -8,8 +8,8 @@ from pathlib import Path
 import msgspec
 
 from swarm.config.scenario import Scenario
+from swarm.config.scenario_files import parse_scenario
 from swarm.config.setting_types import MOST_PER_AGENT, MOST_TARGETS
-from swarm.config.toml_files import parse_scenario
 from swarm.errors import ConfigError
 from swarm.right_of_way.shards import fitting_regions
 

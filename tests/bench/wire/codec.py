@@ -17,7 +17,7 @@ import msgspec
 
 from bench.harness import cpu_ms
 from bench.isolated import isolated, peak_bytes
-from swarm.config.toml_files import load_scenario
+from swarm.config.scenario_files import load_scenario
 from swarm.errors import ProtocolError
 from swarm.wire.codec import MAX_PAYLOAD_BYTES, decode, encode
 from swarm.wire.messages import Message

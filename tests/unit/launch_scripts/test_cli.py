@@ -20,7 +20,7 @@ from launch_scripts.observe.run_folders import begin_run, run_facts
 from launch_scripts.observe.run_observer import frame_of_members
 from shared_map.terrain.map_frame import MapFrame
 from swarm.config.scenario import MonitorConfig, Scenario, TlsConfig
-from swarm.config.toml_files import load_scenario
+from swarm.config.scenario_files import load_scenario
 from swarm.errors import BusError, TerrainError
 from swarm.grid import GridSpec
 from swarm.places import cell_of

@@ -10,7 +10,7 @@ from support.command import Swarm
 
 from launch_scripts.launcher.console import REPORTED
 from launch_scripts.report.compare import LeftRun, circumstances_that_differ, figures, settings_that_differ
-from swarm.config.toml_files import parse_scenario, scenario_text
+from swarm.config.scenario_files import parse_scenario, scenario_text
 
 GAP = {"mean": 1.05, "p95": 1.16, "max": 8.1, "unproven": 3}
 

@@ -14,7 +14,7 @@ from launch_scripts.deploy import certificates
 from launch_scripts.deploy.certificates import THIS_MACHINE, called_of, check_signed, hosts_of
 from launch_scripts.launcher.run_options import as_process
 from launch_scripts.process_table import LAUNCHER, certificate_names, processes_of
-from swarm.config.toml_files import load_scenario
+from swarm.config.scenario_files import load_scenario
 from swarm.errors import ConfigError
 
 SCENARIO = """

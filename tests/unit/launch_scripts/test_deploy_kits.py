@@ -19,7 +19,7 @@ from launch_scripts.deploy.machine_archives import UNIT, keep_plan, keepers_befo
 from launch_scripts.deploy.machine_plan import HostsConfig, Plan, make_plan, parse_hosts
 from launch_scripts.launcher.run_options import as_process, chosen_processes
 from swarm.config.revocations import revoke
-from swarm.config.toml_files import load_scenario, parse_scenario
+from swarm.config.scenario_files import load_scenario, parse_scenario
 from swarm.errors import ConfigError, StoreError
 
 SCENARIO = 'name = "small"\n[[targets]]\ncount = 2\n[[groups]]\nvehicles = 12\n[vehicles]\nper_agent = 3\n'

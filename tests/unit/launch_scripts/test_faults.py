@@ -15,7 +15,7 @@ from launch_scripts.simulation.faults import (
 from launch_scripts.simulation.sample_worlds import SMALL
 from shared_map.replication.marks import MAX_AHEAD_NS
 from swarm.clock import NS_PER_S
-from swarm.config.toml_files import parse_scenario
+from swarm.config.scenario_files import parse_scenario
 
 BEGAN_NS = 1_000 * NS_PER_S
 

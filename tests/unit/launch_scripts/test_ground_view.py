@@ -50,7 +50,7 @@ from shared_map.replication.replica import MapReplica
 from shared_map.terrain.terrain import Terrain, terrain_of_pace
 from swarm.clock import NS_PER_S
 from swarm.config.scenario import Scenario
-from swarm.config.toml_files import parse_scenario
+from swarm.config.scenario_files import parse_scenario
 from swarm.grid import Window
 from swarm.runtime.stats import Counters
 from swarm.wire.messages.map_data import MarkKind, MarkSet

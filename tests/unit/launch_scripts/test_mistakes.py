@@ -27,13 +27,13 @@ from launch_scripts.launcher.forkserver import WarmUp
 from launch_scripts.launcher.local_processes import LocalSwarm
 from launch_scripts.ports import free_ports
 from launch_scripts.process_table import certificate_names
-from swarm.config.toml_files import load_scenario
+from swarm.config.scenario_files import load_scenario
 
 MISTAKES: list[dict[str, Any]] = tomllib.loads(
     Path(__file__).with_name("mistakes.toml").read_text(encoding="utf-8")
 )["mistake"]
 
-TINY = '[terrain]\nsource = "synthetic"\nrows = 24\ncols = 24\nrelief_m = 1\n'
+TINY = '[terrain]\nsource = "synthetic"\nrows = 24\ncols = 24\nrelief_m = 1\n[monitor]\nweb_port = 0\n'
 LAKE = TINY + '[[cost.zones]]\nkind = "forbidden"\nmask = "lake.png"\n'
 RING = TINY + '[[cost.zones]]\nkind = "forbidden"\nmask = "ring.png"\n'
 

@@ -24,7 +24,7 @@ from launch_scripts.observe.latest_messages import LatestState, RunPlan, Vehicle
 from launch_scripts.observe.run_state import state_of
 from launch_scripts.plain_text import Duration
 from swarm.clock import NS_PER_S
-from swarm.config.toml_files import parse_scenario
+from swarm.config.scenario_files import parse_scenario
 from swarm.grid import GridSpec, walk
 from swarm.wire.fields import pack_column
 from swarm.wire.messages.planning import Believed

@@ -8,7 +8,7 @@ from launch_scripts.check.machine_check import Resources, why_no_room
 from launch_scripts.launcher.local_processes import Running
 from launch_scripts.launcher.ordered_planners import LEAVES_TO_OTHERS_S, OrderedPlanners, with_target
 from launch_scripts.process_table import ProcessSpec, processes_of
-from swarm.config.toml_files import parse_scenario
+from swarm.config.scenario_files import parse_scenario
 from swarm.errors import ConfigError
 from swarm.runtime.order_book import OrderBook
 from swarm.wire.messages.orders import Order

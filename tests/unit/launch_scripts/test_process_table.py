@@ -4,7 +4,7 @@ from launch_scripts.launcher.local_processes import Running
 from launch_scripts.launcher.run_options import chosen_processes
 from launch_scripts.process_table import ROLES, STOP_ORDER, ProcessSpec, processes_of
 from swarm.config.scenario import Scenario, StandbyConfig, TargetConfig
-from swarm.config.toml_files import parse_scenario
+from swarm.config.scenario_files import parse_scenario
 
 
 def test_the_table_has_standbys_after_those_that_lead_and_may_be_limited_to_a_rank() -> None:

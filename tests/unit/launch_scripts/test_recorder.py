@@ -20,7 +20,7 @@ from launch_scripts.observe.recorder import BegunRoute, Recorder, Sampling, Thin
 from launch_scripts.observe.summed_counts import CertifiedGap
 from swarm.clock import NS_PER_S
 from swarm.config.scenario import Scenario, StandbyConfig
-from swarm.config.toml_files import parse_scenario
+from swarm.config.scenario_files import parse_scenario
 from swarm.grid import GridSpec
 from swarm.peers import Peer
 from swarm.runtime.stats import CAPTURES_OF, GAPS_TO, Counters

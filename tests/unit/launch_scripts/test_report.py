@@ -24,7 +24,7 @@ from launch_scripts.report.report_and_tracks import TABLES, make_report, read_tr
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.clock import NS_PER_S
 from swarm.config.scenario import Scenario
-from swarm.config.toml_files import load_scenario, parse_scenario, scenario_text
+from swarm.config.scenario_files import load_scenario, parse_scenario, scenario_text
 from swarm.errors import ConfigError, StoreError
 from swarm.files import write_file
 from swarm.grid import GridSpec

@@ -30,7 +30,7 @@ from launch_scripts.simulation.study import (
 )
 from launch_scripts.simulation.study_sweep import ResultStore, Sweep
 from launch_scripts.simulation.trials import Result, Trial, run_trial
-from swarm.config.toml_files import load_scenario
+from swarm.config.scenario_files import load_scenario
 from swarm.errors import ConfigError, StoreError
 
 

@@ -13,7 +13,7 @@ from launch_scripts.commands.terrain_routes import find_route
 from launch_scripts.launcher.run_options import find_scenario
 from launch_scripts.report import plots_and_figures
 from shared_map.terrain.terrain import build_terrain, terrain_of_pace
-from swarm.config.toml_files import load_scenario
+from swarm.config.scenario_files import load_scenario
 
 runner = CliRunner()
 

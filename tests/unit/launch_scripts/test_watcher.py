@@ -19,7 +19,7 @@ from launch_scripts.observe.recorder import Recorder
 from launch_scripts.process_table import ProcessSpec, processes_of
 from swarm.bus.bus import Appeared, Disappeared
 from swarm.clock import NS_PER_S
-from swarm.config.toml_files import parse_scenario
+from swarm.config.scenario_files import parse_scenario
 from swarm.peers import Peer, split_rank
 from swarm.runtime.stats import VIEWERS
 from swarm.wire.messages.orders import Order, Orders

@@ -22,7 +22,7 @@ from shared_map.vehicle_class_grounds import ClassMaps, class_terrains, read_by
 from swarm.bus.bus import AskEnded, Event
 from swarm.clock import NS_PER_S
 from swarm.config.scenario import Scenario
-from swarm.config.toml_files import parse_scenario
+from swarm.config.scenario_files import parse_scenario
 from swarm.grid import TILE_CELLS, walk
 from swarm.wire.messages.map_data import MarkKind
 from swarm.wire.messages.orders import Obey

@@ -15,7 +15,7 @@ from planner_service.kernels.decorators import KERNELS
 from shared_map.terrain.terrain import build_terrain
 from shared_map.vehicle_class_grounds import class_terrains
 from swarm.config.scenario import Scenario
-from swarm.config.toml_files import parse_scenario
+from swarm.config.scenario_files import parse_scenario
 from swarm.config.vehicle_classes import GROUND, first_classes
 
 

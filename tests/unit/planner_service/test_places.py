@@ -17,7 +17,7 @@ from planner_service.tree.partial_growth import PartialGrowth
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.bus.bus import AskEnded, Event, Replied
 from swarm.config.scenario import place_job, places_of
-from swarm.config.toml_files import parse_scenario
+from swarm.config.scenario_files import parse_scenario
 from swarm.grid import walk
 from swarm.wire.messages.map_data import MarkKind
 from swarm.wire.messages.planning import PlaceRouteReply, PlaceRouteRequest, PushedRoute

@@ -11,7 +11,7 @@ from support.planner_swarm import Planners
 from planner_service.target_search import Ways
 from shared_map.terrain.terrain import build_terrain
 from swarm.clock import NS_PER_S
-from swarm.config.toml_files import parse_scenario
+from swarm.config.scenario_files import parse_scenario
 from swarm.grid import GridSpec, walk
 from swarm.wire.fields import column
 from swarm.wire.messages.planning import MOST_BELIEVED, Believed, RouteRequest, Sighted

@@ -29,7 +29,7 @@ from shared_map.vehicle_class_grounds import (
     prepare_classes,
 )
 from swarm.config.scenario import PlannerConfig, Scenario
-from swarm.config.toml_files import parse_scenario
+from swarm.config.scenario_files import parse_scenario
 from swarm.config.vehicle_classes import AirConfig
 from swarm.errors import TerrainError
 from swarm.grid import STEP_COL, STEP_ROW, GridSpec

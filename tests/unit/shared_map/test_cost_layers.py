@@ -12,7 +12,7 @@ from shared_map.terrain.store import kept_key, scenario_key
 from shared_map.terrain.terrain import Terrain, build_terrain
 from shared_map.terrain.true_ground import build_truth
 from swarm.config.scenario import Scenario
-from swarm.config.toml_files import load_scenario
+from swarm.config.scenario_files import load_scenario
 from swarm.errors import ConfigError, RunMismatchError, TerrainError
 from swarm.runtime.membership import check_same_run
 from swarm.runtime.role_setup import RoleSetup

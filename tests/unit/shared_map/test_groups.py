@@ -9,7 +9,7 @@ from support.agent_world import AgentWorld, pace_of
 from shared_map.replication.interest import MarkFilter, readable_for_target
 from shared_map.replication.replica import MapReplica
 from swarm.config.scenario import Scenario, readable_groups
-from swarm.config.toml_files import parse_scenario
+from swarm.config.scenario_files import parse_scenario
 from swarm.grid import GridSpec
 from swarm.runtime.order_book import OrderBook
 from swarm.wire.messages.map_data import MarkKind, MarkSet

@@ -15,7 +15,7 @@ from shared_map.pace_measurements import ONE, Measurement, measurements_in
 from shared_map.replication.tiles import beyond_tile
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.config.scenario import MapConfig, Scenario
-from swarm.config.toml_files import parse_scenario
+from swarm.config.scenario_files import parse_scenario
 from swarm.errors import DamagedError, StoreError, SwarmError
 from swarm.wire.messages.map_data import MarkKind, MarkSet
 

@@ -13,7 +13,7 @@ from support.swarm_model import SwarmModel
 from shared_map.keeper.mark_store import KeeperStore
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.bus.bus import Event
-from swarm.config.toml_files import parse_scenario
+from swarm.config.scenario_files import parse_scenario
 from swarm.grid import GridSpec
 from swarm.peers import Peer
 from swarm.wire.codec import decode, encode

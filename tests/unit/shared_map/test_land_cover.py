@@ -11,7 +11,7 @@ from support.height_models import SIDE, hills, load, said, written
 from shared_map.importers.cover.land_cover import TABLES, read_cover, read_cover_table
 from shared_map.terrain.pace_layers import TerrainClass
 from swarm.config.ground import TerrainConfig
-from swarm.config.toml_files import COVER_TABLES
+from swarm.config.scenario_files import COVER_TABLES
 from swarm.errors import TerrainError
 from swarm.grid import GridSpec
 

@@ -20,9 +20,10 @@ from shared_map.terrain.slope_and_climb import (
     slope_factor,
 )
 from shared_map.terrain.terrain import build_terrain
+from swarm.config.contradictions import cost_faults
 from swarm.config.ground import CostConfig
-from swarm.config.toml_files import load_scenario, parse_scenario
-from swarm.config.vehicle_classes import PRESETS, cost_faults, cost_of_preset
+from swarm.config.scenario_files import load_scenario, parse_scenario
+from swarm.config.vehicle_classes import PRESETS, cost_of_preset
 from swarm.errors import ConfigError
 from swarm.grid import GridSpec
 from swarm.wire.messages.map_data import PACE_LEAST, PACE_MOST

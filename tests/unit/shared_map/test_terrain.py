@@ -24,7 +24,7 @@ from shared_map.terrain.terrain import any_in_blocks, build_terrain, level_of, t
 from shared_map.terrain.true_ground import build_truth
 from swarm.config.ground import CostConfig, TerrainConfig, ZoneConfig
 from swarm.config.scenario import Scenario
-from swarm.config.toml_files import load_scenario
+from swarm.config.scenario_files import load_scenario
 from swarm.errors import StoreError, TerrainError
 from swarm.runtime.role_setup import RoleSetup
 

@@ -17,7 +17,7 @@ from shared_map.keeper.mark_store import KeeperStore
 from shared_map.keeper.zone_orders import rows_of, zone_sets
 from shared_map.replication.replica import MapReplica
 from shared_map.terrain.terrain import terrain_of_pace
-from swarm.config.toml_files import parse_scenario
+from swarm.config.scenario_files import parse_scenario
 from swarm.grid import GridSpec
 from swarm.wire.messages.map_data import MarkKind
 from swarm.wire.messages.orders import Zone, ZoneOrder, Zones

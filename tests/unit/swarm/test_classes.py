@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from swarm.config.scenario import Scenario
-from swarm.config.toml_files import load_scenario, parse_scenario, scenario_text
+from swarm.config.scenario_files import load_scenario, parse_scenario, scenario_text
 from swarm.config.vehicle_classes import cost_of_preset, of_class
 from swarm.errors import ConfigError
 

@@ -8,8 +8,8 @@ import pytest
 
 from swarm.config.explain import meanings
 from swarm.config.scenario import Scenario, crew_of, ids_of, plan_agents
+from swarm.config.scenario_files import load_scenario, parse_scenario, read_scenario
 from swarm.config.setting_types import Section
-from swarm.config.toml_files import load_scenario, parse_scenario, read_scenario
 from swarm.errors import ConfigError
 
 

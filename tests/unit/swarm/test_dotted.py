@@ -4,7 +4,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from swarm.config.toml_files import flat, parse_scenario, with_settings
+from swarm.config.scenario_files import flat, parse_scenario, with_settings
 from swarm.errors import ConfigError
 
 _TABLES = st.recursive(

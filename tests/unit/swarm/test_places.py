@@ -17,7 +17,7 @@ from shared_map.terrain.zones import zone_mask
 from swarm.client.terrain_frame import Frame
 from swarm.config.ground import TerrainConfig, ZoneConfig
 from swarm.config.scenario import Scenario
-from swarm.config.toml_files import parse_scenario
+from swarm.config.scenario_files import parse_scenario
 from swarm.errors import ConfigError, TerrainError
 from swarm.grid import GridSpec
 from swarm.places import bounds_of, cell_of, corners_of, extent_of, fields_of, read_place, written

@@ -17,7 +17,7 @@ from hypothesis import strategies as st
 from support.plugin_modules import forgotten_afterwards
 
 from swarm.config.plugin_names import PLUGIN_KINDS, NamedPlugin
-from swarm.config.toml_files import load_scenario, parse_scenario
+from swarm.config.scenario_files import load_scenario, parse_scenario
 from swarm.errors import ConfigError
 from swarm.plugins import (
     KILLED_BY,

@@ -7,7 +7,7 @@ from hypothesis import assume, given
 from hypothesis import strategies as st
 from msgspec.structs import replace
 
-from swarm.config.toml_files import parse_scenario
+from swarm.config.scenario_files import parse_scenario
 from swarm.errors import StoreError
 from swarm.grid import MAX_CELLS, MOST_SHARD_REGIONS, REGION_CELLS, GridSpec
 from swarm.right_of_way.agent_core import OwnRecord, RightOfWay

@@ -15,7 +15,7 @@ from support.shard_tables import granted_cells, holdings_of
 from shared_map.terrain.terrain import terrain_of_pace
 from shared_map.vehicle_class_grounds import class_grounds
 from swarm.config.scenario import Scenario, plan_agents
-from swarm.config.toml_files import parse_scenario
+from swarm.config.scenario_files import parse_scenario
 from swarm.grid import GridSpec
 from swarm.right_of_way.shards import Shards
 from swarm.wire.fields import column

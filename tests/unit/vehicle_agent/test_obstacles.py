@@ -13,7 +13,7 @@ from shared_map.terrain.slope_and_climb import climb_of
 from swarm.clock import NS_PER_S
 from swarm.config.ground import CostConfig
 from swarm.config.scenario import PlannerConfig
-from swarm.config.toml_files import parse_scenario
+from swarm.config.scenario_files import parse_scenario
 from swarm.errors import ConfigError
 from swarm.grid import GridSpec
 from swarm.right_of_way.holdings import Wish

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import copy
 import datetime
-import ipaddress
 import json
 import logging
 import math
@@ -20,34 +19,12 @@ from typing import Any, NamedTuple
 
 import msgspec
 
-from swarm.config.explain import (
-    choice,
-    complaint,
-    doubled,
-    expected,
-    explain,
-    hints_of,
-    located,
-    meanings,
-    nearest,
-    section_in,
-)
-from swarm.config.ground import ZoneConfig
+from swarm.config.contradictions import Fault, contradictions
+from swarm.config.explain import expected, explain, hints_of, located, meanings, nearest, section_in
 from swarm.config.input_files import MAX_DEPTH, FileKind, parse_toml, quoted, read_text
-from swarm.config.plugin_names import check_name, plugins_of
-from swarm.config.scenario import Scenario, TlsConfig, ids_of
-from swarm.config.setting_types import MOST_TARGETS, RESERVED_GROUPS
-from swarm.config.vehicle_classes import (
-    Fault,
-    aloft_classes,
-    class_faults,
-    complete_costs,
-    cost_faults,
-    with_slope_csv,
-)
+from swarm.config.scenario import Scenario, TlsConfig
+from swarm.config.vehicle_classes import complete_costs, with_slope_csv
 from swarm.errors import ConfigError
-from swarm.peers import split_rank
-from swarm.places import read_place
 
 log = logging.getLogger(__name__)
 
@@ -132,7 +109,7 @@ def read_scenario(
         return Reading(None, faults)
     scenario = msgspec.convert(complete_costs(raw), Scenario)  # only now, so that a fault of [cost] is one fault
     doubtful = {re.sub(r"\.(\d+)", r"[\1]", ".".join(map(str, place))) for place in taken_out}
-    contradictions = []
+    unread: list[Fault] = []
     try:
         classes = tuple(
             msgspec.structs.replace(each, cost=with_slope_csv(each.cost, f"classes[{n}].cost", base))
@@ -142,9 +119,9 @@ def read_scenario(
         scenario = msgspec.structs.replace(scenario, cost=cost, classes=classes)
     except ConfigError as error:
         doubtful.add("cost.slope_csv")
-        contradictions = [((), str(error))]
+        unread = [((), str(error))]
     known = Reading(scenario, faults, frozenset(doubtful))
-    for keys, fault in (*contradictions, *islice(_faults(scenario), _MOST_FAULTS)):
+    for keys, fault in (*unread, *islice(contradictions(scenario), _MOST_FAULTS)):
         if known.knows(*keys):
             faults.append(f"{source}: {fault}")
             doubtful.update(keys)
@@ -213,127 +190,6 @@ def _take_out(raw: dict[str, Any], place: tuple[str | int, ...]) -> bool:
     for step in place[:-1]:
         parent = parent[step]
     return bool(place) and parent.pop(place[-1], None) is not None
-
-
-def _faults(scenario: Scenario) -> Iterator[Fault]:
-    """Yields contradictions between individually valid settings."""
-    named = ("targets.name", "targets.count")
-    count = sum(target.count for target in scenario.targets)
-    if count > MOST_TARGETS:
-        yield named, f"targets: expected at most {MOST_TARGETS} in all, found {count}"
-    ids = scenario.target_ids
-    rovers = (id for rover in scenario.rovers for id in ids_of(rover))
-    classes, groups = (each.name for each in scenario.classes), (each.name for each in scenario.groups)
-    for what, names in {"targets": ids, "rovers": rovers, "classes": classes, "groups": groups}.items():
-        yield from _about(doubled(names, what), f"{what}.name", f"{what}.count")
-    for id in ids:
-        if split_rank(id)[1]:  # planner and standby of two targets would share an id
-            yield named, f"targets: {id!r} is the name of a standby of another target; rename it"
-    for key, section in (("cost", scenario.cost), ("terrain.hidden", scenario.terrain.hidden)):
-        for n, zone in enumerate(section.zones):
-            where = f"{key}.zones[{n}]"
-            yield from _about(complaint(_check_zone, zone, where), where)
-    for n, target in enumerate(scenario.targets):
-        if target.start is not None:
-            key = f"targets[{n}].start"
-            yield from _about(complaint(read_place, target.start, key), key)
-    for n, group in enumerate(scenario.groups):
-        key = f"groups[{n}].cells"
-        for place in group.cells:
-            yield from _about(complaint(read_place, place, key), key)
-    for plugin in plugins_of(scenario):
-        yield from _about(complaint(check_name, plugin), plugin.key)
-    yield from cost_faults(scenario.cost, "cost")
-    aloft = [f"class {name}, which flies" for name in aloft_classes(scenario)]
-    climbs = ["cost.directional = true"] * scenario.cost.directional + aloft
-    if climbs and (weight := scenario.planner.length_weight):
-        said = f"planner.length_weight: {weight:g} does not go with {climbs[0]}; leave it out"
-        yield ("planner.length_weight", "cost.directional", "classes"), said
-    yield from class_faults(scenario)
-    yield from _group_faults(scenario)
-    marked = scenario.monitor.show_target
-    if marked and marked not in scenario.target_ids:
-        known = choice(marked, scenario.target_ids, " there are ")
-        yield ("monitor.show_target", *named), f"monitor.show_target is {marked!r}, which is no target{known}"
-    has_tls = scenario.network.tls is not None
-    for key in ("listen", "connect", "peers"):
-        for endpoint in getattr(scenario.network, key):
-            where = f"network.{key}"
-            yield from _about(complaint(check_endpoint, endpoint, has_tls, where), where, "network.tls")
-
-
-def _about(faults: Iterator[str], *keys: str) -> Iterator[Fault]:
-    return ((keys, each) for each in faults)
-
-
-def _group_faults(scenario: Scenario) -> Iterator[Fault]:
-    ids, names = scenario.target_ids, [group.name for group in scenario.groups]
-    for name in names:
-        reason = RESERVED_GROUPS.get(name.split(".")[0])
-        if reason is not None:
-            yield ("groups.name",), f"groups: {name!r} is not free: {reason}"
-        longer = [other for other in names if other.startswith(f"{name}.")]
-        if longer:  # the id of an author begins with its group and a point
-            said = f"groups: {longer[0]!r} begins with the name of another group, {name!r}, and '.'"
-            yield ("groups.name",), said
-    for n, group in enumerate(scenario.groups):
-        for id in group.targets:
-            if id not in ids:
-                said = f"groups: {group.name} chases {id!r}, which is no target{choice(id, ids, ' there are ')}"
-                yield (f"groups[{n}].targets", "targets.name", "targets.count"), said
-        for key in ("reads", "writes"):
-            for name in getattr(group, key):
-                if name != "*" and name not in names:
-                    said = f"groups: {group.name}: {key} names {name!r}, which is no group{nearest(name, names)}"
-                    yield (f"groups[{n}].{key}", "groups.name"), said
-
-
-_VALUES = {"factor": "factor", "pace": "pace_s_per_m"}
-
-
-def _check_zone(zone: ZoneConfig, where: str) -> None:
-    given = [key for key in ("polygon", "polygon_m", "mask", "file") if getattr(zone, key) is not None]
-    if not given:
-        raise ConfigError(f"{where}: missing required field `polygon` (or `polygon_m`, `mask`, `file`)")
-    if len(given) > 1:
-        raise ConfigError(f"{where}: {given[0]} and {given[1]} exclude each other")
-    for corner in zone.polygon or ():
-        read_place(corner, f"{where}.polygon")
-    if zone.file is None:
-        of_files = [key for key in ("layer", "crs", "attribute", "width_m", "classes") if getattr(zone, key)]
-        if of_files:
-            raise ConfigError(f"{where}: {of_files[0]} goes with file only, found {given[0]}")
-        if zone.kind in _VALUES and zone.value is None:
-            raise ConfigError(f"{where}: missing required field `{_VALUES[zone.kind]}`")
-    for kind, key in _VALUES.items():
-        if getattr(zone, key) is not None and zone.kind != kind:
-            raise ConfigError(f"{where}: {key} goes with kind {kind}, found {zone.kind!r}")
-
-
-def check_endpoint(endpoint: str, has_tls: bool, where: str) -> None:
-    """Raises ConfigError on an invalid endpoint, and on one beyond loopback without mutual TLS."""
-    match = re.fullmatch(r"(tcp|tls)/(\[[0-9a-fA-F:]+\]|[^:/\[\]]+):(\d{1,5})", endpoint)
-    if match is None:
-        why = ": quic/ is not offered, as strangers could keep members out" if endpoint.startswith("quic/") else ""
-        such = "expected one such as tcp/127.0.0.1:7447 or tls/host:7447"
-        raise ConfigError(f"{where}: {endpoint!r} is not an endpoint{why}; {such}")
-    if int(match[3]) > 65535:
-        raise ConfigError(f"{where}: {endpoint!r} is not an endpoint: a port is at most 65535")
-    protocol, host = match[1], match[2].strip("[]")
-    if protocol == "tls" and not has_tls:
-        raise ConfigError(f"{where}: {endpoint} needs network.tls with ca, certificate and key, or --tls-dir")
-    if protocol == "tcp" and not is_loopback(host):
-        raise ConfigError(
-            f"{where}: {endpoint} leaves this machine in the clear; use tls/{host}:{match[3]} with network.tls"
-        )
-
-
-def is_loopback(host: str) -> bool:
-    """Returns True if a host is this machine by name or address."""
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return host == "localhost"
 
 
 def anchored(scenario: Scenario, base: Path) -> Scenario:
