@@ -32,7 +32,7 @@ from swarm.config.ground import CostConfig
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec, Window
 from swarm.wire.messages.planning import RouteRequest
-from swarm.wire.route_columns import RouteStatus
+from swarm.wire.route_columns import NO_TARGET, RouteStatus
 from swarm.wire.topics import ROUTE
 
 
@@ -200,6 +200,17 @@ def test_whatever_happens_answers_keep_the_laws_and_a_worker_catches_up(
         play.check()
         if np.isfinite(play.pace.flat[play.target]):
             assert play.tree.target_cell == play.target
+
+
+@LARGE
+def test_the_bound_beyond_the_frontier_counts_time_only_where_length_has_a_price() -> None:
+    play = Play(np.ones((40, 40), np.float32), PlannerConfig(length_weight=4.0), has_worker=True)
+    routes = play.tree.routes(np.arange(play.grid.cells))
+    beyond = routes.statuses == NO_TARGET
+    assert beyond.any()
+    bound, optimum = routes.lower_bound_s[beyond], naive.cost_to_go(play.pace, play.target, **play.rules)
+    assert (bound > 0).all()
+    assert (bound <= optimum.reshape(-1)[beyond]).all()
 
 
 @LARGE
