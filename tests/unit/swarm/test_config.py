@@ -70,6 +70,22 @@ def test_a_fault_of_cost_is_said_once_however_many_classes_have_it_from_there():
         assert len(read_scenario(text, "s").faults) == 1
 
 
+@pytest.mark.parametrize(
+    ("setting", "meant"),
+    [
+        ('[vehicles]\nsense_range_m = "60 m"', "sense_range_m = 60"),
+        ('[vehicles]\nsense_range_m = "1,5 km"', "sense_range_m = 1500"),
+        ('seconds = "90 s"', "seconds = 90"),
+        ('seconds = "2 min"', "seconds = 120"),
+        ('[[targets]]\nspeed_m_per_s = "36 km/h"', "speed_m_per_s = 10"),
+        ('[[targets]]\nspeed_m_per_s = "3 m/s"', "speed_m_per_s = 3"),
+    ],
+)
+def test_a_number_with_its_unit_is_answered_in_the_unit_of_the_key(setting: str, meant: str) -> None:
+    with pytest.raises(ConfigError, match=rf"leave out the unit: {meant}$"):
+        parse_scenario(setting)
+
+
 def test_relative_files_lie_beside_the_scenario(tmp_path):
     path = tmp_path / "demo.toml"
     path.write_text("[terrain]\nsource = 'hills.tif'\nphoto = 'hills-photo.tif'")
