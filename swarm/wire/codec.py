@@ -13,6 +13,7 @@ from __future__ import annotations
 
 import base64
 import contextlib
+import enum
 import math
 import re
 import reprlib
@@ -60,6 +61,15 @@ _LIMITS: dict[str, Any] = {
 }
 _STEPS = re.compile(r"([^.\[\]]+)|\[(\d+)\]")
 """Parts of a path such as `held.cells[3]`: names and indices."""
+_KINDS = {
+    "int": "a whole number",
+    "float": "a number",
+    "str": "a text",
+    "bool": "true or false",
+    "array": "a list",
+    "object": "a map",
+}
+_SIGNS = {"<": "less than", "<=": "at most", ">": "more than", ">=": "at least"}
 _MANY_SETS = 8
 """Number of mark sets from which on checking them as arrays is faster than one by one."""
 _STATEMENT_COLUMNS = ("cells", "kinds", "paces", "stamps_ns")
@@ -178,24 +188,45 @@ def _converted(fields: dict[Any, Any], message_type: type[M]) -> M:
     try:
         return msgspec.convert(fields, message_type, builtin_types=_BYTES)
     except Exception as error:
-        raise ProtocolError(field_fault(error, fields)) from error
+        raise ProtocolError(field_fault(error, fields, message_type)) from error
 
 
-def field_fault(error: Exception, fields: Mapping[Any, Any]) -> str:
-    """Returns msgspec's fault of a field, as a sentence: its name, the value expected and the value found."""
-    expected, _, place = str(error).partition(" - at `$")
+def field_fault(error: Exception, fields: Mapping[Any, Any], message_type: type[Message]) -> str:
+    """Returns msgspec's fault of a field, as a sentence: its name, the value found and the value expected."""
+    said, _, place = str(error).replace("`key` in ", "").partition(" - at `$")
     path = place.rstrip("`").lstrip(".")
+    expected = _in_words(said)
     if not path:
         return (expected or type(error).__name__)[:300]
-    if expected.startswith("Invalid"):  # states the value found itself
-        return f"{path}: {expected}"[:300]
     found: Any = fields
     try:
         for name, index in _STEPS.findall(path):
             found = found[int(index)] if index else found[name]
     except (LookupError, TypeError):  # a place in a mapping, which msgspec writes as [...]
         return f"{path}: {expected}"[:300]
-    return f"{path}: {expected}, found {reprlib.repr(found)}"[:300]
+    if said.startswith("Invalid enum value"):
+        allowed = _choices(_hints_of(message_type).get(path))
+        expected = f"one of {', '.join(map(repr, allowed))}" if allowed else "another value"
+    return f"{path}: found {reprlib.repr(found)}, expected {expected}"[:300]
+
+
+def _in_words(said: str) -> str:
+    """Returns what msgspec expected, such as "Expected `int | null` >= 0", without its names of types."""
+    if (parts := re.fullmatch(r"Expected `([a-z |]+)`(.*?)(?:, got `[^`]*`)?", said, re.DOTALL)) is None:
+        return said
+    kinds = " or ".join(_KINDS.get(kind, kind) for kind in parts[1].split(" | "))
+    return kinds + re.sub("[<>]=?", lambda sign: _SIGNS[sign[0]], parts[2])
+
+
+def _choices(hint: Any) -> list[Any]:
+    """The values of a Literal or an enumeration, which may be optional."""
+    bare, _ = taken_apart(hint)
+    if isinstance(bare, enum.EnumMeta):
+        return [each.value for each in bare]
+    inner = typing.get_args(bare)
+    return (
+        list(inner) if typing.get_origin(bare) is typing.Literal else [x for each in inner for x in _choices(each)]
+    )
 
 
 def _checked(message: M) -> M:
@@ -237,6 +268,8 @@ def decode_parameters(parameters: dict[str, str], message_type: type[M]) -> M:
     """The request in a selector such as `?row=40&col=200`. Raises ProtocolError on a parameter that does not
     fit."""
     fields = {key: value for key, value in parameters.items() if key != "format"}
+    if parameters.get("format", "json") != "json":
+        raise ProtocolError(f"format: found {parameters['format'][:_QUOTED]!r}, expected 'json', or leave it out")
     allowed = message_type.__struct_fields__
     unknown = sorted(set(fields) - set(allowed))
     if unknown:
@@ -244,7 +277,7 @@ def decode_parameters(parameters: dict[str, str], message_type: type[M]) -> M:
     try:
         return msgspec.convert({**fields, "schema": schema_of_type(message_type)}, message_type, strict=False)
     except (msgspec.ValidationError, ValueError) as error:
-        raise ProtocolError(field_fault(error, fields)) from error
+        raise ProtocolError(field_fault(error, fields, message_type)) from error
 
 
 def may_be_json(payload: bytes) -> bool:
