@@ -231,18 +231,22 @@ def find_swarm(runs: Path | None = None, name: str | None = None) -> list[tuple[
         looked = "it names no router" if network is None else ", ".join(network.connect)
         raise BusError(f"run {name} does not run here: no process listens ({looked})")
     # Of runs with the same router only the newest can be connected to it.
-    by_router: dict[tuple[str, ...], tuple[KnownRun | None, NetworkConfig]] = {}
-    here = (each for each in registered() if runs is None or each.folder.parent == runs.resolve())
-    for run, network in islice(((run, found) for run in here if (found := network_of(run.folder))), _NEWEST):
-        by_router.setdefault(network.connect, (run, network))
+    by_router: dict[tuple[str, ...], tuple[KnownRun, NetworkConfig]] = {}
+    here = (
+        (each, network_of(each.folder))
+        for each in registered()
+        if runs is None or each.folder.parent == runs.resolve()
+    )
+    for run, its in islice(((run, its) for run, its in here if its is not None), _NEWEST):
+        by_router.setdefault(its.connect, (run, its))
     # The port of a run that has ended may be that of a stranger.
     found = [
-        (run.name, network)
-        for run, network in by_router.values()
-        if any(map(listening, network.connect)) and (run.launchers or run.processes())
+        (run.name, its)
+        for run, its in by_router.values()
+        if any(map(listening, its.connect)) and (run.launchers or run.processes())
     ]
     usual = NetworkConfig()
-    if all(network.connect != usual.connect for _, network in found) and any(map(listening, usual.connect)):
+    if all(its.connect != usual.connect for _, its in found) and any(map(listening, usual.connect)):
         found.append(("", usual))
     if found:
         return found

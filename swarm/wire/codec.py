@@ -221,7 +221,7 @@ def _in_words(said: str) -> str:
 def _choices(hint: Any) -> list[Any]:
     """The values of a Literal or an enumeration, which may be optional."""
     bare, _ = taken_apart(hint)
-    if isinstance(bare, enum.EnumMeta):
+    if isinstance(bare, type) and issubclass(bare, enum.Enum):
         return [each.value for each in bare]
     inner = typing.get_args(bare)
     return (
