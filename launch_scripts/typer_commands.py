@@ -233,7 +233,6 @@ def _files_of(incomplete: str) -> Iterator[str]:
 _NO_PATHS = (errno.ENAMETOOLONG, errno.ELOOP, errno.EACCES, errno.EPERM, errno.ENOTDIR)
 """Errors about a path that cannot be one, or not for this user."""
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
-_BOUNDS = {"greater": "at least", "less": "at most"}
 _SYNONYMS = {
     "start": ("up", "start"), "run": ("up",), "stop": ("down", "stop"), "quit": ("down",), "log": ("logs",),
     "list": ("ls", "ps"), "ls": ("ps",), "init": ("new",), "create": ("new", "add"), "version": ("--version",),
@@ -311,7 +310,7 @@ def _sentence(error: TyperException) -> str:
     if wrong:
         said = said.replace(wrong[0]["msg"], f"found {quoted(wrong[0]['input'])}; {wrong[0]['msg']}")
         said = re.sub("Value error, |, unable to parse [^;]*", "", said).replace("Input should be", "expected")
-        said = re.sub("(greater|less) than or equal to", lambda most: _BOUNDS[most[1]], said)
+        said = said.replace("greater than or equal to", "at least").replace("less than or equal to", "at most")
     elif param is not None and said.startswith("Missing") and param.help:
         said = f"{said.removesuffix('.')}: {param.help}"
     elif unknown := re.fullmatch(r"No such command '(.*)'\.", said, re.DOTALL):

@@ -232,13 +232,10 @@ def find_swarm(runs: Path | None = None, name: str | None = None) -> list[tuple[
         raise BusError(f"run {name} does not run here: no process listens ({looked})")
     # Of runs with the same router only the newest can be connected to it.
     by_router: dict[tuple[str, ...], tuple[KnownRun, NetworkConfig]] = {}
-    here = (
-        (each, network_of(each.folder))
-        for each in registered()
-        if runs is None or each.folder.parent == runs.resolve()
-    )
-    for run, its in islice(((run, its) for run, its in here if its is not None), _NEWEST):
-        by_router.setdefault(its.connect, (run, its))
+    here = (each for each in registered() if runs is None or each.folder.parent == runs.resolve())
+    for run in islice(here, _NEWEST):
+        if its := network_of(run.folder):
+            by_router.setdefault(its.connect, (run, its))
     # The port of a run that has ended may be that of a stranger.
     found = [
         (run.name, its)

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 import base64
 import contextlib
-import enum
 import math
 import re
 import reprlib
@@ -61,15 +60,8 @@ _LIMITS: dict[str, Any] = {
 }
 _STEPS = re.compile(r"([^.\[\]]+)|\[(\d+)\]")
 """Parts of a path such as `held.cells[3]`: names and indices."""
-_KINDS = {
-    "int": "a whole number",
-    "float": "a number",
-    "str": "a text",
-    "bool": "true or false",
-    "array": "a list",
-    "object": "a map",
-}
-_SIGNS = {"<": "less than", "<=": "at most", ">": "more than", ">=": "at least"}
+_KINDS = {"int": "a whole number", "float": "a number", "str": "a text", "bool": "true or false"}
+"""msgspec's names of types, in words."""
 _MANY_SETS = 8
 """Number of mark sets from which on checking them as arrays is faster than one by one."""
 _STATEMENT_COLUMNS = ("cells", "kinds", "paces", "stamps_ns")
@@ -205,28 +197,17 @@ def field_fault(error: Exception, fields: Mapping[Any, Any], message_type: type[
     except (LookupError, TypeError):  # a place in a mapping, which msgspec writes as [...]
         return f"{path}: {expected}"[:300]
     if said.startswith("Invalid enum value"):
-        allowed = _choices(_hints_of(message_type).get(path))
-        expected = f"one of {', '.join(map(repr, allowed))}" if allowed else "another value"
+        hint = _hints_of(message_type).get(path)
+        words = [word for each in (hint, *typing.get_args(hint)) for word in typing.get_args(each)]
+        expected = f"one of {', '.join(repr(word) for word in words if isinstance(word, str))}"
     return f"{path}: found {reprlib.repr(found)}, expected {expected}"[:300]
 
 
 def _in_words(said: str) -> str:
-    """Returns what msgspec expected, such as "Expected `int | null` >= 0", without its names of types."""
-    if (parts := re.fullmatch(r"Expected `([a-z |]+)`(.*?)(?:, got `[^`]*`)?", said, re.DOTALL)) is None:
-        return said
-    kinds = " or ".join(_KINDS.get(kind, kind) for kind in parts[1].split(" | "))
-    return kinds + re.sub("[<>]=?", lambda sign: _SIGNS[sign[0]], parts[2])
-
-
-def _choices(hint: Any) -> list[Any]:
-    """The values of a Literal or an enumeration, which may be optional."""
-    bare, _ = taken_apart(hint)
-    if isinstance(bare, type) and issubclass(bare, enum.Enum):
-        return [each.value for each in bare]
-    inner = typing.get_args(bare)
-    return (
-        list(inner) if typing.get_origin(bare) is typing.Literal else [x for each in inner for x in _choices(each)]
-    )
+    """Returns what msgspec expected, such as "Expected `int | null` >= 0, got `str`", without names of types."""
+    before, _, rest = said.removeprefix("Expected ").partition(", got `")[0].partition("`")
+    names, _, bound = rest.partition("`")
+    return before + " or ".join(_KINDS.get(name, name) for name in names.split(" | ")) + bound
 
 
 def _checked(message: M) -> M:
