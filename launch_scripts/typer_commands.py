@@ -310,6 +310,7 @@ def _sentence(error: TyperException) -> str:
     if wrong:
         said = said.replace(wrong[0]["msg"], f"found {quoted(wrong[0]['input'])}; {wrong[0]['msg']}")
         said = re.sub("Value error, |, unable to parse [^;]*", "", said).replace("Input should be", "expected")
+        said = said.replace("greater than or equal to", "at least").replace("less than or equal to", "at most")
     elif param is not None and said.startswith("Missing") and param.help:
         said = f"{said.removesuffix('.')}: {param.help}"
     elif unknown := re.fullmatch(r"No such command '(.*)'\.", said, re.DOTALL):
@@ -353,7 +354,8 @@ def _elsewhere(word: str, ctx: Any) -> list[str]:
 def _paths(command: Any, words: str = "swarm") -> Iterator[str]:
     """Yields the words of a command, also with each of its options, and those of the commands in it."""
     yield words
-    yield from (f"{words} {option}" for each in command.params for option in each.opts)
+    options = (option for each in command.params for option in each.opts if option.startswith("-"))
+    yield from (f"{words} {option}" for option in options)
     for name, each in getattr(command, "commands", {}).items():
         yield from _paths(each, f"{words} {name}")
 

@@ -141,7 +141,8 @@ class RouteFinder:
         block = np.atleast_2d(_paces(pace))
         window = Window(row, col, row + block.shape[0], col + block.shape[1])
         if block.ndim != 2 or row < 0 or col < 0 or window.row1 > self.grid.rows or window.col1 > self.grid.cols:
-            raise ValueError(f"{window} is not inside {self.grid.rows} x {self.grid.cols} cells")
+            place = f"rows {row} to {window.row1 - 1} and columns {col} to {window.col1 - 1}"
+            raise ValueError(f"{place} are not inside {self.grid.rows} x {self.grid.cols} cells")
         self._pace[row : window.row1, col : window.col1] = block
         self._version += 1
         if self._goals is not None:

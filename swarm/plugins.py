@@ -27,7 +27,7 @@ from typing import Any, TypeVar
 
 import msgspec
 
-from swarm.config.explain import converted, nearest
+from swarm.config.explain import allowed_here, converted, nearest
 from swarm.config.input_files import quoted
 from swarm.config.plugin_names import NamedPlugin, check_name, plugins_of
 from swarm.config.scenario import Scenario
@@ -248,7 +248,7 @@ def _options(named: NamedPlugin, wanted: Any) -> Any:
     allowed = [field.encode_name for field in msgspec.structs.fields(wanted)]
     for unknown in named.options.keys() - set(allowed):  # a struct that does not forbid them
         hint = nearest(unknown, allowed)
-        raise ConfigError(f"{key} of {named.name}: unknown key {unknown}{hint}; allowed here: {', '.join(allowed)}")
+        raise ConfigError(f"{key} of {named.name}: unknown key {unknown}{hint}{allowed_here(allowed, hint)}")
     return options
 
 

@@ -311,7 +311,11 @@ def _near(closed: Bools, place: tuple[int, int]) -> str:
 
 def check_scenario(path: Path, runs: Path, port: int | None) -> tuple[list[Finding], dict[str, Any], str]:
     """Returns the findings, failures first, and the facts of a scenario whose ground was built, also in words."""
-    read = read_scenario(read_text(path, FileKind.SCENARIO), str(path), path.parent)
+    try:
+        text = read_text(path, FileKind.SCENARIO)
+    except ConfigError as error:
+        return [failure("", str(error))], {}, ""
+    read = read_scenario(text, str(path), path.parent)
     found = [failure("", fault) for fault in read.faults]
     facts: dict[str, Any] = {}
     if read.scenario is not None:

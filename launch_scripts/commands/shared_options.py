@@ -219,30 +219,38 @@ def find_swarm(runs: Path | None = None, name: str | None = None) -> list[tuple[
     name  of the run, or its folder; only that is looked at then
     Raises BusError if no router listens, ConfigError if there is no run of that name.
     """
-    from launch_scripts.observe.run_folders import RUNS, find_run, registered
+    from launch_scripts.observe.run_folders import RUNS, KnownRun, find_run, registered
     from swarm.bus.endpoints import listening
     from swarm.config.scenario import NetworkConfig
 
     if name is not None:
-        folders = [find_run(name, runs or RUNS)]
-    else:
-        folders = [each.folder for each in registered() if runs is None or each.folder.parent == runs.resolve()]
-    networks = ((folder.resolve().name, network_of(folder)) for folder in folders)
-    tried = list(islice(((run, network) for run, network in networks if network is not None), _NEWEST))
-    if name is None:
-        tried.append(("", NetworkConfig()))
-    # Of runs with the same router only the newest can be connected to it.
-    by_router = {network.connect: (run, network) for run, network in reversed(tried)}
-    newest_first = sorted(by_router.values(), key=tried.index)
-    if found := [each for each in newest_first if any(map(listening, each[1].connect))]:
-        return found
-    if name is not None:
-        looked = ", ".join(each for _, network in tried for each in network.connect) or "it names no router"
+        folder = find_run(name, runs or RUNS)
+        network = network_of(folder)
+        if network is not None and any(map(listening, network.connect)):
+            return [(folder.resolve().name, network)]
+        looked = "it names no router" if network is None else ", ".join(network.connect)
         raise BusError(f"run {name} does not run here: no process listens ({looked})")
+    # Of runs with the same router only the newest can be connected to it.
+    by_router: dict[tuple[str, ...], tuple[KnownRun, NetworkConfig]] = {}
+    here = (each for each in registered() if runs is None or each.folder.parent == runs.resolve())
+    for run in islice(here, _NEWEST):
+        if its := network_of(run.folder):
+            by_router.setdefault(its.connect, (run, its))
+    # The port of a run that has ended may be that of a stranger.
+    found = [
+        (run.name, its)
+        for run, its in by_router.values()
+        if any(map(listening, its.connect)) and (run.launchers or run.processes())
+    ]
+    usual = NetworkConfig()
+    if all(its.connect != usual.connect for _, its in found) and any(map(listening, usual.connect)):
+        found.append(("", usual))
+    if found:
+        return found
     runs_in = "your runs" if runs is None else f"the runs in {runs}"
     raise BusError(
-        f"no swarm runs here: no process listens at any router of {runs_in} or at the usual endpoint "
-        f"({tried[-1][1].connect[0]}); --connect names another"
+        f"no swarm runs here: no process listens at a router of {runs_in} or at the usual endpoint "
+        f"({usual.connect[0]}); --connect names another"
     )
 
 

@@ -393,8 +393,8 @@ def examined(
         )
     if found.uncertain > _TOLD_SHARE and config.level_is == "water":
         notes.append(
-            f"! level ground: {found.uncertain:.1%} of the file is dead level, too, and taken for ground, as its"
-            " shore is not that of water or its heights are rounded; of water say terrain.water_below_m"
+            f"! level ground: {found.uncertain:.1%} of the file is level, but counts as ground, because its shore"
+            " is not like that of water or its heights are rounded; if it is water, set terrain.water_below_m"
         )
     return voids, found.mask, notes
 

@@ -201,14 +201,12 @@ class KeptOrders:
         return order
 
     def _placed(self, given: orders.GiveOrder) -> orders.GiveOrder:
-        """With a cell for a place, or for row and column: outside the grid that is none. Raises ConfigError."""
-        grid = self._terrain.grid
-        if given.at:
-            return replace(given, cell=cell_of(given.at, MapFrame(grid), "at"), at="")
-        if given.row is None or given.col is None:
+        """With a cell for a place, or for row and column. Raises ConfigError outside the grid."""
+        at = given.at
+        if not at and (given.row is None or given.col is None):
             return given
-        inside = grid.inside(given.row, given.col)
-        return replace(given, cell=grid.cell(given.row, given.col) if inside else grid.cells, row=None, col=None)
+        cell = cell_of(at or f"cell:{given.row},{given.col}", MapFrame(self._terrain.grid), "at")
+        return replace(given, cell=cell, at="", row=None, col=None)
 
     def _orders(self, given: orders.Order | None = None) -> orders.Orders:
         return orders.Orders(role="keeper", id=self._id, orders=list(self.book), given=given)

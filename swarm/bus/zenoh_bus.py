@@ -174,8 +174,11 @@ def _why_not(error: zenoh.ZError, network: NetworkConfig, mode: str) -> BusError
     log.info("zenoh says: %s", error)
     if mode == "router":
         return BusError(f"cannot listen on {', '.join(network.listen)}: {why_not_listening(error)}")
-    reasons = dict.fromkeys(why_silent(endpoint, network.tls is not None) for endpoint in network.connect)
-    return BusError(f"cannot reach a router at {', '.join(network.connect)}: {'; '.join(reasons)}")
+    reasons: dict[str, list[str]] = {}
+    for endpoint in network.connect:
+        reasons.setdefault(why_silent(endpoint, network.tls is not None), []).append(endpoint)
+    places = "; nor at ".join(f"{', '.join(endpoints)}: {reason}" for reason, endpoints in reasons.items())
+    return BusError(f"cannot reach a router at {places}")
 
 
 class ZenohBus:

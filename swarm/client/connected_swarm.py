@@ -367,8 +367,8 @@ def connect(
     from swarm.runtime.run_secret import authenticator_of
 
     files = (ca, certificate, key)
-    if any(files) and not all(files):
-        raise ConfigError("give all three of ca, certificate and key, or none")
+    if not all(files) and (any(files) or endpoint.startswith("tls/")):
+        raise ConfigError(f"endpoint {endpoint!r}: a tls/ endpoint needs ca, certificate and key, others none")
     check_endpoint(endpoint, all(files), "endpoint")
     fields = {"namespace": namespace, "connect": [endpoint], "connect_timeout_s": timeout_s}
     try:

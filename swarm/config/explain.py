@@ -268,7 +268,7 @@ def choice(word: str, allowed: Sequence[str], lead: str = " allowed: ") -> str:
         return near
     if len(every) > _LONGEST_LIST:
         every = f"{every[: every.rfind(',', 0, _LONGEST_LIST)]}, ..."
-    return f"{near};{lead}{every}"
+    return f"{near} {lead.strip().capitalize()} {every}" if near else f";{lead}{every}"
 
 
 # --- a key that is not known -----------------------------------------------------------------------------------
@@ -280,24 +280,20 @@ def _unknown(key: str, name: str, section: Any, root: type) -> str:
         key = repr(key)
     where = f"{name}.{key}" if name else key
     if len(key) > 60:
-        return f"unknown key {name + '.' if name else ''}{key[:57]}...; {_allowed_here(allowed)}"
+        return f"unknown key {name + '.' if name else ''}{key[:57]}...{allowed_here(allowed)}"
     if advice := _meant(where):
         return f"unknown key {where}{advice}"
     near = nearest(key, allowed)
-    elsewhere = [place for place, other in _places(root) if other is not section and _holds(other, key)]
+    elsewhere = [place for place, other in _places(root) if other is not section and key in hints_of(other)]
     if elsewhere and not difflib.get_close_matches(key, allowed, n=1, cutoff=0.75):
         return f"unknown key {where}; {key} belongs {' or '.join(elsewhere[:3])}"
-    every = _allowed_here(allowed)
-    return f"unknown key {where}{near}" + (f"; {every}" if not near or len(every) <= _LONGEST_LIST else "")
+    every = allowed_here(allowed, near)
+    return f"unknown key {where}{near}" + (every if not near or len(every) <= _LONGEST_LIST else "")
 
 
-def _allowed_here(allowed: Sequence[str]) -> str:
-    return f"allowed here: {', '.join(allowed)}"
-
-
-def _holds(section: Any, key: str) -> bool:
-    """True if a section has a setting of this name which is no section itself."""
-    return key in (hints := hints_of(section)) and not section_in(hints[key])
+def allowed_here(allowed: Sequence[str], near: str = "") -> str:
+    """Returns the end of a sentence about an unknown key, after the nearest of the allowed ones."""
+    return f"{' A' if near else '; a'}llowed here: {', '.join(allowed)}"
 
 
 def _places(root: type) -> Iterator[tuple[str, Any]]:

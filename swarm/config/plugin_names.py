@@ -114,4 +114,5 @@ def check_name(plugin: NamedPlugin) -> None:
     if name in allowed or ":" in name:
         return
     choices = ", ".join([*map(repr, allowed), "or a plug-in as 'module:Name'"])
-    raise ConfigError(f"{plugin.key}: found {quoted(name)}{nearest(name, allowed)}; allowed: {choices}")
+    near = nearest(name, allowed)
+    raise ConfigError(f"{plugin.key}: found {quoted(name)}{f'{near} A' if near else '; a'}llowed: {choices}")

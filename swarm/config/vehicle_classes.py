@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 import msgspec
 from msgspec import Meta
 
-from swarm.config.explain import choice, nearest
+from swarm.config.explain import choice
 from swarm.config.ground import CostConfig, ZoneConfig
 from swarm.config.input_files import FileKind, quoted, read_text
 from swarm.config.setting_types import Name, Positive, Section, Slope, SlopeFactor
@@ -55,7 +55,7 @@ def cost_of_preset(name: str | None) -> CostConfig:
     if name is None:
         return CostConfig()
     if name not in PRESETS:
-        raise ConfigError(f"no preset {quoted(name)}{nearest(name, list(PRESETS))}; there are {', '.join(PRESETS)}")
+        raise ConfigError(f"no preset {quoted(name)}{choice(name, list(PRESETS), ' there are ')}")
     return msgspec.convert(whole_cost({}, {"preset": name}), CostConfig)
 
 

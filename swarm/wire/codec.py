@@ -60,6 +60,8 @@ _LIMITS: dict[str, Any] = {
 }
 _STEPS = re.compile(r"([^.\[\]]+)|\[(\d+)\]")
 """Parts of a path such as `held.cells[3]`: names and indices."""
+_KINDS = {"int": "a whole number", "float": "a number", "str": "a text", "bool": "true or false"}
+"""msgspec's names of types, in words."""
 _MANY_SETS = 8
 """Number of mark sets from which on checking them as arrays is faster than one by one."""
 _STATEMENT_COLUMNS = ("cells", "kinds", "paces", "stamps_ns")
@@ -178,24 +180,34 @@ def _converted(fields: dict[Any, Any], message_type: type[M]) -> M:
     try:
         return msgspec.convert(fields, message_type, builtin_types=_BYTES)
     except Exception as error:
-        raise ProtocolError(field_fault(error, fields)) from error
+        raise ProtocolError(field_fault(error, fields, message_type)) from error
 
 
-def field_fault(error: Exception, fields: Mapping[Any, Any]) -> str:
-    """Returns msgspec's fault of a field, as a sentence: its name, the value expected and the value found."""
-    expected, _, place = str(error).partition(" - at `$")
+def field_fault(error: Exception, fields: Mapping[Any, Any], message_type: type[Message]) -> str:
+    """Returns msgspec's fault of a field, as a sentence: its name, the value found and the value expected."""
+    said, _, place = str(error).replace("`key` in ", "").partition(" - at `$")
     path = place.rstrip("`").lstrip(".")
+    expected = _in_words(said)
     if not path:
         return (expected or type(error).__name__)[:300]
-    if expected.startswith("Invalid"):  # states the value found itself
-        return f"{path}: {expected}"[:300]
     found: Any = fields
     try:
         for name, index in _STEPS.findall(path):
             found = found[int(index)] if index else found[name]
     except (LookupError, TypeError):  # a place in a mapping, which msgspec writes as [...]
         return f"{path}: {expected}"[:300]
-    return f"{path}: {expected}, found {reprlib.repr(found)}"[:300]
+    if said.startswith("Invalid enum value"):
+        hint = _hints_of(message_type).get(path)
+        words = [word for each in (hint, *typing.get_args(hint)) for word in typing.get_args(each)]
+        expected = f"one of {', '.join(repr(word) for word in words if isinstance(word, str))}"
+    return f"{path}: found {reprlib.repr(found)}, expected {expected}"[:300]
+
+
+def _in_words(said: str) -> str:
+    """Returns what msgspec expected, such as "Expected `int | null` >= 0, got `str`", without names of types."""
+    before, _, rest = said.removeprefix("Expected ").partition(", got `")[0].partition("`")
+    names, _, bound = rest.partition("`")
+    return before + " or ".join(_KINDS.get(name, name) for name in names.split(" | ")) + bound
 
 
 def _checked(message: M) -> M:
@@ -237,6 +249,8 @@ def decode_parameters(parameters: dict[str, str], message_type: type[M]) -> M:
     """The request in a selector such as `?row=40&col=200`. Raises ProtocolError on a parameter that does not
     fit."""
     fields = {key: value for key, value in parameters.items() if key != "format"}
+    if parameters.get("format", "json") != "json":
+        raise ProtocolError(f"format: found {parameters['format'][:_QUOTED]!r}, expected 'json', or leave it out")
     allowed = message_type.__struct_fields__
     unknown = sorted(set(fields) - set(allowed))
     if unknown:
@@ -244,7 +258,7 @@ def decode_parameters(parameters: dict[str, str], message_type: type[M]) -> M:
     try:
         return msgspec.convert({**fields, "schema": schema_of_type(message_type)}, message_type, strict=False)
     except (msgspec.ValidationError, ValueError) as error:
-        raise ProtocolError(field_fault(error, fields)) from error
+        raise ProtocolError(field_fault(error, fields, message_type)) from error
 
 
 def may_be_json(payload: bytes) -> bool:

@@ -16,9 +16,18 @@ from support.wire_strategies import BY_TYPE, EXAMPLES, MESSAGES
 
 from swarm.bus.bus import asker_in
 from swarm.errors import ProtocolError
-from swarm.wire.codec import MAX_JSON_BYTES, decode, encode, encode_json, may_be_json, packed_json
+from swarm.wire.codec import (
+    MAX_JSON_BYTES,
+    decode,
+    decode_parameters,
+    encode,
+    encode_json,
+    may_be_json,
+    packed_json,
+)
 from swarm.wire.messages import Message, schema_of
 from swarm.wire.messages.map_data import MarkSet
+from swarm.wire.messages.orders import GiveOrder
 from swarm.wire.messages.planning import CostRequest, PushedRoute, TargetPose
 from swarm.wire.messages.vehicles import Obstacle
 from swarm.wire.topics import TOPICS
@@ -100,8 +109,9 @@ def test_a_column_is_a_list_of_its_numbers_or_base64_of_its_bytes():
         (MarkSet, {"cells": [5]}, "cells has 2 bytes, expected 2 values of 2"),
         (Obstacle, {"heading": 1.0}, "unknown field 'heading'; Obstacle has id, group"),
         (Obstacle, {"x_m": None}, "x_m"),
-        (Obstacle, {"x_m": "1"}, "x_m"),
-        (Obstacle, {"seq": 1.5}, "seq"),
+        (Obstacle, {"x_m": "1"}, "x_m: found '1', expected a number"),
+        (Obstacle, {"seq": 1.5}, "seq: found 1.5, expected a whole number"),
+        (GiveOrder, {"subject": "paus"}, "subject: found 'paus', expected one of 'pause', 'vehicle', 'group'"),
         (Obstacle, {"seq": 1 << 70}, "OverflowError"),
         (Obstacle, {"id": "a/b"}, "id 'a/b' is not 1 to 64 of letters"),
         (PushedRoute, {"route": {"status": "ok", "start": 1, "directions": ["UP"]}}, "route.directions has 'UP'"),
@@ -161,6 +171,12 @@ def test_twenty_thousand_mutations_of_json_raise_nothing_but_protocol_errors():
         except ProtocolError:
             pass
     assert 0 < accepted < 10_000
+
+
+def test_a_reply_has_one_format_beside_messagepack() -> None:
+    assert decode_parameters({"row": "4", "col": "2", "format": "json"}, CostRequest).row == 4
+    with pytest.raises(ProtocolError, match="format: found 'xml', expected 'json'"):
+        decode_parameters({"row": "4", "col": "2", "format": "xml"}, CostRequest)
 
 
 def test_a_request_may_be_json_too():

@@ -14,7 +14,7 @@ from support.command import Swarm
 
 from launch_scripts.commands.run_commands import _chosen
 from launch_scripts.commands.shared_options import Where, find_swarm
-from launch_scripts.observe.run_folders import _started_s, begin_run, find_run, register, registered
+from launch_scripts.observe.run_folders import KnownRun, _started_s, begin_run, find_run, register, registered
 from launch_scripts.ports import free_ports
 from swarm.config.scenario import NetworkConfig, Scenario
 from swarm.errors import BusError, ConfigError
@@ -70,11 +70,25 @@ def test_the_newest_run_whose_router_listens_is_found_whatever_its_port_and_name
     assert find_swarm(tmp_path, str(tmp_path / "mine"))[0][0] == "mine"
 
 
-def test_a_port_that_a_later_run_took_over_is_that_runs(tmp_path: Path, listens: list[int]) -> None:
+def test_a_port_that_a_later_run_took_over_is_that_runs(
+    tmp_path: Path, listens: list[int], monkeypatch: pytest.MonkeyPatch
+) -> None:
     make_run(tmp_path, "earlier", listens[0])
     make_run(tmp_path, "later", listens[0])
     make_run(tmp_path, "over", listens[1], over=True)
-    assert [run for run, _ in find_swarm(tmp_path)] == ["later", "over"]
+    assert [run for run, _ in find_swarm(tmp_path)] == ["later"], (
+        "a stranger listens where the run that is over did"
+    )
+    monkeypatch.setattr(KnownRun, "processes", lambda run: {"router-0": 1} if run.name == "over" else {})
+    assert [run for run, _ in find_swarm(tmp_path)] == ["later", "over"], (
+        "its launcher was killed, its router lives"
+    )
+
+
+def test_a_stranger_at_the_router_of_an_ended_run_is_not_that_run(tmp_path: Path, listens: list[int]) -> None:
+    make_run(tmp_path, "over", listens[0], over=True)
+    with pytest.raises(BusError, match="no swarm runs here"):
+        find_swarm()
 
 
 def test_what_was_looked_at_is_said_when_nothing_runs(tmp_path: Path) -> None:

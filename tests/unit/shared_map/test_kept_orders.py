@@ -86,8 +86,9 @@ def test_a_store_that_cannot_be_written_acknowledges_nothing(world: BookWorld) -
 def test_a_target_is_put_on_passable_ground_of_the_terrain_only(world: BookWorld) -> None:
     world.keeper("k", KeeperStore(":memory:"))
     assert world.give(subject="target", name="x", row=3, col=4, new=True) == "target x: [3, 4] is lethal"
-    outside = world.give(subject="target", name="x", row=-1, col=4, new=True)
-    assert "is not in 20 x 30 cells" in outside
+    outside = world.give(subject="target", name="x", row=400, col=4, new=True)
+    assert outside == "target x: at is 'cell:400,4', outside the terrain: 20 x 30 cells"
+    assert "'cell:-1,4'" in world.give(subject="target", name="x", row=-1, col=4, new=True)
     assert isinstance(world.give(subject="target", name="x", row=3, col=5, new=True), list)
 
 

@@ -88,7 +88,7 @@ def test_a_module_beside_the_scenario_is_found_and_options_become_its_struct_or_
         ("eyes:Wid", {}, "no 'Wid' in {folder}/eyes.py; did you mean 'Wide'?"),
         ("eyes:NUMBER", {}, "'eyes:NUMBER' is 7; expected a class or a function"),
         ("eyes:Odd", {}, "Options of 'eyes:Odd' is no msgspec Struct"),
-        ("eyes:Wide", {"reach": 3}, "unknown key reach; did you mean 'reach_cells'?; allowed here: reach_cells"),
+        ("eyes:Wide", {"reach": 3}, "unknown key reach; did you mean 'reach_cells'? Allowed here: reach_cells"),
         (
             "eyes:Wide",
             {"reach_cells": "x"},
@@ -109,9 +109,7 @@ def test_what_cannot_be_found_or_made_or_does_not_fit_is_refused_in_one_sentence
 
 
 def test_a_name_that_nobody_offers_is_refused_when_the_scenario_is_read() -> None:
-    with pytest.raises(
-        ConfigError, match=r"targets\[1\]\.walk: found 'evad'; did you mean 'evade'\?; allowed: 'st"
-    ):
+    with pytest.raises(ConfigError, match=r"targets\[1\]\.walk: found 'evad'; did you mean 'evade'\? Allowed: 'st"):
         parse_scenario("[[targets]]\nname = 'a'\n[[targets]]\nwalk = 'evad'")
     for key in ("[vehicles]\nsensor", "[vehicles]\nassignment", "[vehicles]\ndynamics", "[planner]\nstrategy"):
         with pytest.raises(ConfigError, match=r"allowed: '.*or a plug-in as 'module:Name'"):
