@@ -30,8 +30,7 @@ from launch_scripts.simulation.world.walks import (
 from shared_map.terrain.slope_and_climb import climb_of
 from swarm.clock import NS_PER_S
 from swarm.config.ground import CostConfig
-from swarm.config.scenario import TargetConfig
-from swarm.config.setting_types import Walk
+from swarm.config.scenario import TargetConfig, Walk
 from swarm.config.toml_files import parse_scenario
 from swarm.errors import ConfigError, TerrainError
 from swarm.grid import GridSpec
