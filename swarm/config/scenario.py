@@ -40,7 +40,7 @@ Sensor = Literal["truth"]
 Assigner = Literal["spread", "cheapest", "balanced"]
 Dynamics = Literal["ground"]
 Strategy = Literal["auto", "exact", "full", "variable_range", "multi_resolution", "variable_range+multi_resolution"]
-"""What is built in of each kind of plug-in. Docstrings of the sections below explain the names; `swarm/plugins.py`
+"""Built-in names of each kind of plug-in. Docstrings of the sections below explain the names; `swarm/plugins.py`
 says how the others are found."""
 
 UNTIL_STOPPED_S = 1e9
