@@ -33,6 +33,7 @@ from typer.core import TyperCommand, TyperGroup
 from typer.exceptions import TyperException
 
 from launch_scripts.plain_text import plain
+from launch_scripts.report import AREAS, FORMATS, SEVERAL
 from swarm.config.explain import bounds_of, choice, meanings, nearest
 from swarm.config.input_files import quoted
 from swarm.errors import EXTRAS, ConfigError, StoreError, SwarmError, missing
@@ -56,6 +57,8 @@ PART = "A part of a swarm"
 CONTEXT = {"help_option_names": ["-h", "--help"]}
 """Settings of every command, which inherits them from the root."""
 _ROW = re.compile(r"\w+(, \w+)*  +\S")
+_LISTS = {"layers": ", ".join(FORMATS), "areas": ", ".join(AREAS), "several": " and ".join(SEVERAL)}
+"""Formats for which a word in braces stands, in the row of an option: a new format is in every help."""
 _AS_IT_STANDS = (" ", "\b", "[", "swarm ")
 """Lines of examples and tables begin so: they keep their line ends, whereas prose fills the terminal's width."""
 
@@ -122,7 +125,7 @@ def _prose(docstring: str | None) -> str:
 
 def _called_with_options(function: Callable[..., int | None]) -> Callable[..., None]:
     """The function as Typer reads it: every dataclass parameter is replaced by the fields of its class."""
-    said = meanings(function)
+    said = {name: text.format(**_LISTS) for name, text in meanings(function).items()}
     groups: dict[str, Any] = {}
     parameters: list[inspect.Parameter] = []
     for each in inspect.signature(function, eval_str=True).parameters.values():

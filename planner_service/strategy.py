@@ -2,7 +2,7 @@
 
 A row gives the search after a move of the target, its width, the condition of a full search, and the thinning of
 far cells. `TargetTree` and `Planner` ask the row that is in force and compare no names: a new strategy is a row
-here, and its name in `swarm.config.setting_types.Strategy`, or a plug-in. Sections are those of Wan et al.
+here, and its name in `swarm.config.scenario.Strategy`, or a plug-in. Sections are those of Wan et al.
 """
 
 from __future__ import annotations

@@ -49,11 +49,12 @@ def route(
     start          LAT,LON, xy:X,Y in metres of the map, or cell:ROW,COL from the north-west.
     end            Instead of a target: the destination, in the same forms as --from.
     vehicle_class  Class of the vehicle.
-    out            Write .geojson, .gpkg, .gpx, .kml, .csv, .plan or .waypoints; with --terrain also .png.
+    out            Write {layers}, .plan or .waypoints; with --terrain also .png.
     """
     from launch_scripts.commands import terrain_routes
     from launch_scripts.launcher.run_options import find_scenario
-    from launch_scripts.report.gis_formats import FORMATS, MISSIONS, check_target
+    from launch_scripts.report import FORMATS, MISSIONS
+    from launch_scripts.report.gis_formats import check_target
     from swarm.places import read_place
 
     check_target(out, "--out", *FORMATS, *MISSIONS, ".png", force=force)

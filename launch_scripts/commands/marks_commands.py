@@ -19,7 +19,8 @@ from launch_scripts.commands.shared_options import AsJson, Force, Where
 from launch_scripts.launcher.console import columns
 from launch_scripts.observe.run_observer import ask_learned
 from launch_scripts.plain_text import number_of
-from launch_scripts.report.gis_formats import AREAS, TIFF, check_target, write_layers, write_raster
+from launch_scripts.report import AREAS
+from launch_scripts.report.gis_formats import TIFF, check_target, write_layers, write_raster
 from launch_scripts.report.run_gis_layers import mark_layer
 from launch_scripts.typer_commands import command, family_app
 from shared_map.keeper.mark_store import KeeperStore
@@ -119,7 +120,7 @@ def export(store: Store, out: Path, force: Force = False) -> None:
 
     swarm marks export runs/LAST/map.sqlite marks.gpkg
 
-    out  .json: all marks; .tif, .gpkg, .geojson, .kml, .csv: the winning marks.
+    out  .json: all marks; .tif, {areas}: the winning marks.
     """
     terrain, grid, sets = _read(store)
     check_target(out, "OUT", ".json", *TIFF, *AREAS, force=force)

@@ -125,7 +125,7 @@ def export(
     swarm runs export LAST --format mcap
 
     what    tracks, targets, captures, routes or marks; may be given several times; all by default.
-    format  geojson, csv or gpx: a file per layer; gpkg or kml: one file; mcap: ROS 2 messages.
+    format  {layers}, without the dot; {several}: one file; mcap: ROS 2 messages.
     out     A file, whose ending is its format, or a folder; by default export/ in the run's folder.
     """
     from launch_scripts.report.run_gis_layers import ENDINGS, WHAT, export_run

@@ -18,7 +18,8 @@ from rich.table import Table
 from launch_scripts.commands.shared_options import AsJson, Crs, Force, PresetOption, VehicleClass, duration
 from launch_scripts.launcher.console import progress
 from launch_scripts.launcher.run_options import find_scenario
-from launch_scripts.report.gis_formats import AREAS, TIFF, check_target, write_raster
+from launch_scripts.report import AREAS
+from launch_scripts.report.gis_formats import TIFF, check_target, write_raster
 from launch_scripts.typer_commands import command, family_app
 from shared_map.terrain.pace_layers import TerrainClass
 from shared_map.terrain.slope_and_climb import said_of_cost
@@ -253,7 +254,7 @@ def reach(
     to       Destination: LAT,LON, xy:X,Y in metres or cell:ROW,COL.
     start    Start of a corridor: only cells on near-optimal paths from there.
     slack    With --from: a path may take this share longer than the best.
-    out      Write .tif: seconds, -1 without a path; .geojson, .gpkg, .kml or .csv: areas.
+    out      Write .tif: seconds, -1 without a path; {areas}: areas.
     every_s  Time between areas. Default 600 s; for a corridor a fifth of the slack time.
     """
     from launch_scripts.commands import terrain_routes

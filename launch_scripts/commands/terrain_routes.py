@@ -15,7 +15,7 @@ import typer
 from numpy.typing import NDArray
 
 from launch_scripts.observe.palette import said_length
-from launch_scripts.report import gis_formats
+from launch_scripts.report import MISSIONS, gis_formats
 from planner_service.route_finder import RouteFinder
 from shared_map.array_files import Floats
 from shared_map.terrain.map_frame import MapFrame, middles_of
@@ -140,7 +140,7 @@ def write_route(route: DescribedRoute, path: Path) -> None:
     """Writes a route in the format of the file's ending. Raises ConfigError or StoreError in one sentence, also
     without a place on Earth or a terrain where the format needs one."""
     ending = path.suffix.lower()
-    if ending in gis_formats.MISSIONS:
+    if ending in MISSIONS:
         if route.grid.crs == "local":
             raise ConfigError(f"--out {path}: the terrain has no place on Earth; write .csv, .geojson or .gpkg")
         x_m, y_m = middles_of(route.grid, gis_formats.turns_of(route.cells, route.grid))

@@ -28,6 +28,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from launch_scripts.report import AREAS, FORMATS, ON_EARTH
 from shared_map.terrain.map_frame import MapFrame
 from swarm.errors import ConfigError, StoreError, require
 from swarm.files import check_writable, replacing, write_file
@@ -84,18 +85,6 @@ class Layer:
         return f"{self.about} {'; '.join(fields)}.".strip(" .") + "." if self.about else ""
 
 
-FORMATS: Mapping[str, str] = {".geojson": "GeoJSON", ".gpkg": "GPKG", ".kml": "LIBKML", ".gpx": "GPX", ".csv": ""}
-"""Ending -> GDAL's driver of layers; none: `_write_csv`."""
-SEVERAL = (".gpkg", ".kml")
-"""Endings of the formats of which a file holds several layers."""
-_ON_EARTH = (".kml", ".gpx")
-"""Endings of the formats whose places are always longitudes and latitudes."""
-AREAS = tuple(ending for ending in FORMATS if ending != ".gpx")
-"""Endings of the formats which have areas."""
-TIFF = (".tif", ".tiff")
-"""Endings of rasters (`write_raster`)."""
-
-
 def check_target(path: Path | None, option: str, *endings: str, force: bool = False) -> None:
     """Raises ConfigError or StoreError now, not after the work, if a file cannot be written.
 
@@ -130,7 +119,7 @@ def write_layers(path: Path, layers: Sequence[Layer], frame: MapFrame) -> None:
     check_target(path, "--out", *FORMATS, force=True)
     ending, placed = path.suffix.lower(), frame.grid.crs != "local"
     driver = FORMATS[ending]
-    if not placed and ending in _ON_EARTH:
+    if not placed and ending in ON_EARTH:
         raise ConfigError(f"--out {path}: the terrain has no place on Earth; write .csv, .geojson or .gpkg")
     if ending not in AREAS and any(layer.shape == "Polygon" for layer in layers):
         raise ConfigError(f"--out {path}: {driver} has no areas; write {' or '.join(AREAS)}")
@@ -367,6 +356,9 @@ def transform_of(grid: GridSpec) -> Any:
     return from_origin(grid.west_m, grid.north_m, grid.resolution_m, grid.resolution_m)
 
 
+TIFF = (".tif", ".tiff")
+
+
 def write_raster(
     path: Path,
     bands: Sequence[NDArray[Any]],
@@ -417,7 +409,6 @@ def write_raster(
 
 # --- missions of ground stations: QGroundControl's .plan, Mission Planner's .waypoints ----------------------------
 
-MISSIONS = (".plan", ".waypoints")
 _WAYPOINT = 16
 """MAVLink's command to drive to a place."""
 _FRAME = 3

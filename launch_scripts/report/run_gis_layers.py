@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from launch_scripts.observe.run_folders import REPORT_FILE, lacks, read_report
+from launch_scripts.report import AREAS, FORMATS, SEVERAL
 from launch_scripts.report import gis_formats as gis
 from launch_scripts.report.gis_formats import Feature, Layer
 from launch_scripts.report.report_and_tracks import TRACKS_FILE, RunTracks, Track, read_tracks
@@ -132,7 +133,7 @@ WHAT: Mapping[str, Callable[[RunTracks, Groups], list[Layer]]] = {
 """Name of an export -> its layers."""
 
 
-ENDINGS = (*(ending.removeprefix(".") for ending in gis.FORMATS), "mcap")
+ENDINGS = (*(ending.removeprefix(".") for ending in FORMATS), "mcap")
 """The words of `swarm runs export --format`."""
 
 # --- files of `swarm runs export` ---------------------------------------------------------------------------------
@@ -148,10 +149,10 @@ def export_run(folder: Path, what: Sequence[str], format: str, out: Path | None,
     """
     tracks = tracks_of_run(folder)
     groups = groups_of(read_report(folder)) if (folder / REPORT_FILE).exists() else {}
-    names = what or [name for name in WHAT if name != "marks" or f".{format}" in gis.AREAS]
+    names = what or [name for name in WHAT if name != "marks" or f".{format}" in AREAS]
     layers = [layer for name in WHAT if name in names for layer in WHAT[name](tracks, groups)]
     run = folder.resolve().name
-    if f".{format}" in gis.SEVERAL:
+    if f".{format}" in SEVERAL:
         files = {f"{run}.{format}": layers}
     else:
         files = {f"{run}-{layer.name}.{format}": [layer] for layer in layers}

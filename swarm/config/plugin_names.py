@@ -12,8 +12,7 @@ from typing import get_args
 
 from swarm.config.explain import nearest
 from swarm.config.input_files import quoted
-from swarm.config.scenario import Scenario, TargetConfig, VehicleConfig
-from swarm.config.setting_types import Assigner, Dynamics, Sensor, Strategy, Walk
+from swarm.config.scenario import Assigner, Dynamics, Scenario, Sensor, Strategy, TargetConfig, VehicleConfig, Walk
 from swarm.errors import ConfigError
 
 

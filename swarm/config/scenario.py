@@ -17,10 +17,8 @@ from swarm.config.ground import CostConfig, TerrainConfig
 from swarm.config.setting_types import (
     MOST_PER_AGENT,
     MOST_TARGETS,
-    Assigner,
     CommonName,
     Count,
-    Dynamics,
     GroupName,
     Name,
     NotNegative,
@@ -29,16 +27,21 @@ from swarm.config.setting_types import (
     Positive,
     ProcessName,
     Section,
-    Sensor,
     Standbys,
-    Strategy,
-    Walk,
     plugin_name,
 )
 from swarm.config.vehicle_classes import GROUND, MOST_CLASSES, ClassConfig, WindConfig
 from swarm.errors import ConfigError
 from swarm.grid import MOST_SHARD_REGIONS
 from swarm.peers import ranked_id
+
+Walk = Literal["still", "random", "waypoints", "evade", "external"]
+Sensor = Literal["truth"]
+Assigner = Literal["spread", "cheapest", "balanced"]
+Dynamics = Literal["ground"]
+Strategy = Literal["auto", "exact", "full", "variable_range", "multi_resolution", "variable_range+multi_resolution"]
+"""Built-in names of each kind of plug-in. Docstrings of the sections below explain the names; `swarm/plugins.py`
+says how the others are found."""
 
 UNTIL_STOPPED_S = 1e9
 """A run whose `seconds` are as many ends when it is stopped."""

@@ -35,21 +35,12 @@ MOST_PER_AGENT = 1000
 MOST_TARGETS = 1000
 """Limit for all entries together."""
 
-Strategy = Literal["auto", "exact", "full", "variable_range", "multi_resolution", "variable_range+multi_resolution"]
 Preset = Literal["hiker", "wheeled", "tracked", "quadruped"]
 
 Slope = Annotated[float, Meta(gt=-90, lt=90)]
 SlopeFactor = Annotated[float, Meta(ge=0.01, le=100)]
 SpeedOnGround = Annotated[float, Meta(ge=0.01, le=340)]
 """m/s; what a map can tell of a cell (`swarm.wire.messages.map_data.PACE_LEAST` and `PACE_MOST`)."""
-
-Walk = Literal["still", "random", "waypoints", "evade", "external"]
-
-Sensor = Literal["truth"]
-
-Assigner = Literal["spread", "cheapest", "balanced"]
-
-Dynamics = Literal["ground"]
 
 
 def plugin_name(built_in: Any = None) -> Meta:

@@ -10,8 +10,7 @@ from planner_service.goal_tree_cache import GoalTrees
 from planner_service.kernels.queue_dial import NO_AIM
 from planner_service.target_tree import TargetTree
 from planner_service.tree.partial_growth import PartialGrowth
-from swarm.config.scenario import PlannerConfig
-from swarm.config.setting_types import Strategy
+from swarm.config.scenario import PlannerConfig, Strategy
 from swarm.grid import GridSpec, Window
 from swarm.wire.route_columns import RouteBatch, RouteStatus
 

@@ -6,8 +6,7 @@ from support.planner_strategies import random_pace
 
 from planner_service import target_tree
 from planner_service.target_tree import TargetTree
-from swarm.config.scenario import PlannerConfig
-from swarm.config.setting_types import Strategy
+from swarm.config.scenario import PlannerConfig, Strategy
 from swarm.grid import GridSpec, Window
 
 

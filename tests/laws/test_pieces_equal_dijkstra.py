@@ -19,8 +19,7 @@ from planner_service.tree import partitioned_tree as pieces
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
 from planner_service.tree.partitioned_tree import PartitionedTree
-from swarm.config.scenario import PlannerConfig
-from swarm.config.setting_types import Strategy
+from swarm.config.scenario import PlannerConfig, Strategy
 from swarm.grid import GridSpec, Window
 from swarm.wire.route_columns import OK, RouteBatch
 

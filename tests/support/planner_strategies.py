@@ -9,12 +9,13 @@ import numpy as np
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from planner_service.strategy import ROWS
 from shared_map.terrain.slope_and_climb import ENTRIES, Climb, Wind, climb_of
 from swarm.config.ground import CostConfig, SlopeRule
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec
 
-STRATEGIES = ("full", "exact", "variable_range", "multi_resolution", "variable_range+multi_resolution", "auto")
+STRATEGIES = (*ROWS, "auto")
 
 RULES: tuple[dict[str, Any], ...] = (
     {"neighbours": 8, "edge": "octile", "corner_cutting": False},

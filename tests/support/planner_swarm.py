@@ -21,8 +21,7 @@ from swarm.bus.bus import AskEnded, Event, Heard, Post, Replied
 from swarm.bus.memory_bus import MemoryBus
 from swarm.bus.scheduler import InlineWorker
 from swarm.clock import NS_PER_S
-from swarm.config.scenario import PlannerConfig, Scenario, TargetConfig
-from swarm.config.setting_types import Strategy
+from swarm.config.scenario import PlannerConfig, Scenario, Strategy, TargetConfig
 from swarm.grid import GridSpec, walk
 from swarm.wire.messages import Message
 from swarm.wire.messages.map_data import MarkKind

@@ -18,8 +18,7 @@ from support.planner_strategies import RULES, Job, Marks, Move, random_climb, ra
 from support.slow_twins import Cells, Driven, cost_to_go, drive
 
 from planner_service.kernel_build import load_all
-from swarm.config.scenario import PlannerConfig
-from swarm.config.setting_types import Strategy
+from swarm.config.scenario import PlannerConfig, Strategy
 from swarm.grid import GridSpec
 from swarm.wire.route_columns import LETHAL_START, OK, UNREACHABLE, RouteBatch
 

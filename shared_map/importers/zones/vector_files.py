@@ -201,8 +201,8 @@ def _source(path: Path, what: str) -> tuple[str | bytes, Kind]:
     if kind is None:
         if path.suffix.lower() in (".dbf", ".shx", ".prj"):
             raise TerrainError(f"{what} is a part of a Shapefile; name the .shp beside it")
-        neither = "GeoJSON, GeoPackage, Shapefile, FlatGeobuf, KML, GPX, OSM XML, .plan nor .waypoints"
-        raise TerrainError(f"{what} {other_format(head, f'is neither {neither}, nor a .zip of one')}")
+        neither = f"is neither {DRAWINGS['names']}, nor a .zip of one"
+        raise TerrainError(f"{what} {other_format(head, neither)}")
     absolute = path.resolve()
     source = str(absolute) if member is None else f"/vsizip/{{{absolute}}}/{member}"
     if not kind.text:

@@ -24,8 +24,7 @@ from bench.harness import cpu_ms, track
 from launch_scripts.simulation.world.walks import WALKS, Budget, Walker, WalkWorld
 from planner_service.strategy import ROWS, STAGES
 from planner_service.target_tree import TargetTree, Update
-from swarm.config.scenario import PlannerConfig
-from swarm.config.setting_types import Strategy, Walk
+from swarm.config.scenario import PlannerConfig, Strategy, Walk
 from swarm.errors import ConfigError
 from swarm.grid import walk
 from swarm.wire.route_columns import OK, RouteBatch

@@ -18,8 +18,7 @@ from bench.harness import FieldOption, Seed, benchmark, names_of, numbers_of, tr
 from bench.planning.chase import Plan, Tally, chase
 from planner_service.kernel_build import load_all
 from planner_service.strategy import ROWS
-from swarm.config.scenario import PlannerConfig
-from swarm.config.setting_types import Strategy, Walk
+from swarm.config.scenario import PlannerConfig, Strategy, Walk
 
 PAPERS: Strategy = "variable_range+multi_resolution"
 TABLE_1 = [(targets, vehicles) for targets in (1, 5, 10) for vehicles in (10, 50, 100)]

@@ -21,9 +21,9 @@ from shared_map.terrain.terrain import terrain_of_pace
 from shared_map.vehicle_class_grounds import class_grounds
 from swarm.config.explain import expected, meanings
 from swarm.config.ground import TerrainConfig
-from swarm.config.scenario import PLACE_TREES_BYTES, GroupConfig, Scenario, TargetConfig, plan_agents
+from swarm.config.scenario import PLACE_TREES_BYTES, GroupConfig, Scenario, TargetConfig, Walk, plan_agents
 from swarm.config.scenario_files import commented, load_scenario, parse_scenario, read_scenario
-from swarm.config.setting_types import Preset, Walk
+from swarm.config.setting_types import Preset
 from swarm.errors import ConfigError
 from swarm.grid import GridSpec
 from vehicle_agent.start_cells import spawn_cells

@@ -21,6 +21,7 @@ from launch_scripts.cli import command, main
 from launch_scripts.commands.shared_options import duration
 from launch_scripts.launcher.run_options import find_scenario
 from launch_scripts.observe.run_folders import begin_run, version_of
+from launch_scripts.report import AREAS, FORMATS
 
 
 def offered(*words: str) -> list[str]:
@@ -61,6 +62,13 @@ def test_every_command_completes_its_options_and_its_sub_commands() -> None:
         assert declared <= set(offered(*path, "--")), path
         if hasattr(each, "list_commands"):
             assert each.list_commands(None) == [name for name in offered(*path, "") if name[0] != "-"], path
+
+
+def test_help_names_every_format_that_a_command_writes() -> None:
+    said = {" ".join(path): " ".join(str(param.help) for param in each.params) for path, each in EVERY}
+    writers = {"route": FORMATS, "runs export": FORMATS, "terrain reach": AREAS, "marks export": AREAS}
+    for words, formats in writers.items():
+        assert all(ending in said[words] for ending in formats), said[words]
 
 
 def test_every_command_answers_to_h_as_to_help(swarm: Swarm, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -30,15 +30,15 @@ from launch_scripts.simulation.world.walks import (
 from shared_map.terrain.slope_and_climb import climb_of
 from swarm.clock import NS_PER_S
 from swarm.config.ground import CostConfig
-from swarm.config.scenario import TargetConfig
+from swarm.config.scenario import TargetConfig, Walk
 from swarm.config.scenario_files import parse_scenario
-from swarm.config.setting_types import Walk
 from swarm.errors import ConfigError, TerrainError
 from swarm.grid import GridSpec
 from swarm.wire.messages.vehicles import Obstacle
 from vehicle_agent.traffic.obstacles import REACTION_S, capsule_of
 
 NOBODY = np.empty(0, np.int64)
+MOVING = [walk for walk in WALKS if walk not in ("still", "external")]
 
 
 def terrain(pace: NDArray[np.float32]) -> TrueTerrain:
@@ -58,7 +58,7 @@ def walker(
     return Walker(where, WALKS[walk](world), slowness, cell)
 
 
-@pytest.mark.parametrize("walk", ["random", "waypoints", "evade"])
+@pytest.mark.parametrize("walk", MOVING)
 def test_no_target_takes_a_step_that_is_too_steep_and_none_outruns_the_climb(walk: Walk) -> None:
     """Terraces, each of which may be left downhill only."""
     heights = np.repeat(np.arange(6, dtype=np.float32) * 0.6 * RES, 5)[:, None] + np.zeros((30, 34), np.float32)
@@ -106,7 +106,7 @@ def test_a_terrain_without_a_passable_cell_is_refused() -> None:
 
 
 @settings(deadline=None, max_examples=25)
-@given(st.integers(0, 10_000), st.sampled_from(["random", "waypoints", "evade"]))
+@given(st.integers(0, 10_000), st.sampled_from(MOVING))
 def test_every_step_of_every_walk_is_legal(seed: int, walk: Walk) -> None:
     where = terrain(rough(seed, 0.3, 30, 34))
     one = walker(where, where.random_home(random.Random(seed)), walk, seed=seed)

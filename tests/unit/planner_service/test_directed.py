@@ -11,9 +11,8 @@ from shared_map.terrain.store import load_prepared, save_prepared
 from shared_map.terrain.synthetic import mountain_noise
 from shared_map.terrain.terrain import build_terrain
 from swarm.config.ground import CostConfig, TerrainConfig
-from swarm.config.scenario import Scenario
+from swarm.config.scenario import Scenario, Strategy
 from swarm.config.scenario_files import parse_scenario
-from swarm.config.setting_types import Strategy
 from swarm.errors import ConfigError
 from swarm.grid import GridSpec
 

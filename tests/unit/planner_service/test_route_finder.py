@@ -11,7 +11,7 @@ from support.planner_strategies import random_pace
 
 import planner_service
 from planner_service import RouteFinder
-from swarm.config.setting_types import Strategy
+from swarm.config.scenario import Strategy
 from swarm.errors import ConfigError, OutsideGridError
 from swarm.wire.route_columns import RouteStatus, TargetStatus
 

@@ -16,8 +16,7 @@ from planner_service.growth_times import MODEL_EXACT_NS_PER_CELL, MODEL_NEAR_NS_
 from planner_service.target_tree import TargetTree
 from planner_service.tree import partitioned_tree
 from swarm.config.plugin_names import PLUGIN_KINDS, NamedPlugin
-from swarm.config.scenario import PlannerConfig
-from swarm.config.setting_types import Strategy
+from swarm.config.scenario import PlannerConfig, Strategy
 from swarm.grid import GridSpec, Window
 from swarm.plugins import Plugin
 

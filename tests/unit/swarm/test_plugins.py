@@ -16,6 +16,8 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support.plugin_modules import forgotten_afterwards
 
+from launch_scripts.simulation.world.walks import WALKS
+from planner_service.strategy import STRATEGIES
 from swarm.config.plugin_names import PLUGIN_KINDS, NamedPlugin
 from swarm.config.scenario_files import load_scenario, parse_scenario
 from swarm.errors import ConfigError
@@ -30,6 +32,7 @@ from swarm.plugins import (
     find_plugin,
     named_plugin,
 )
+from vehicle_agent.assignment import ASSIGNERS
 
 MODULE = """
 import msgspec
@@ -255,3 +258,8 @@ def test_whatever_a_scenario_names_is_found_or_refused_in_one_sentence(name: str
     with pytest.raises(ConfigError) as refused:
         find_plugin(sensor(name), "/nowhere")
     assert "\n" not in str(refused.value)
+
+
+@pytest.mark.parametrize(("kind", "rows"), [("walk", WALKS), ("strategy", STRATEGIES), ("assignment", ASSIGNERS)])
+def test_every_name_that_a_scenario_may_use_has_a_row_and_every_row_a_name(kind, rows) -> None:
+    assert set(PLUGIN_KINDS[kind].built_in) == set(rows)
