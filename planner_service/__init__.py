@@ -15,8 +15,9 @@ bound of the cost of any route. The planner ensures this in six steps:
 6. *Push.* A follower is pushed another route if its route passes a change or begins in a grown part, and the
    other differs.
 
-The walk from a pose to a pushed route. `PlannerService.tick` calls steps 1, 4 and 10; each other step is called by
-an earlier one. Values are returned; no step calls back. The bus and the codec precede step 1.
+The walk from a pose to a pushed route. `PlannerService.tick` calls steps 1 and 4, and 10 through `_perform`; each
+other step is called by an earlier one. Values are returned; no step calls back. The bus and the codec precede
+step 1.
 
 1. `service.py`: `_take_collected` takes the poses since the last tick from the bus.
 2. `tracker_notes.py`: `TargetWatch.on_pose` stores the pose if it counts, and reports oddities.
@@ -28,7 +29,7 @@ an earlier one. Values are returned; no step calls back. The bus and the codec p
 7. `followers.py`: `Followers.touch` marks the routes that a change concerns, `due` selects those to push now.
 8. `tree/route_bounds.py`: `read_routes`, called by `TargetTree.routes`, reads new routes with proven bounds.
 9. `any_angle_routes.py`: `Puller.pull_batch` straightens them if the scenario says so.
-10. `service.py`: `_perform` publishes each `PushedRoute`.
+10. `planning_process.py`: `_push`, called by `PlannerService._perform`, publishes each `PushedRoute`.
 
 The states of a planner:
 

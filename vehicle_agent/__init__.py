@@ -8,13 +8,14 @@ The walk from a mark to another vehicle's route. Steps 1 to 6 run in the agent w
 in a planner, 19 and 20 in the agent of the other vehicle:
 
 1. `service.py`: `AgentService._drive` drives all vehicles for the time of a tick.
-2. `agent.py`: `Agent.drive` returns the findings at each cell.
+2. `agent.py`: `Agent.drive` returns the findings at each cell, by steps 3 and 4.
 3. `driving/driver.py`: `Driver.drive` notes the cells that vehicles have entered.
 4. `sensing/sensor.py`: `compare` returns the cells in sight that differ from the map.
 5. `shared_map/replication/replica.py`: `MapReplica.write` states them as marks, and applies them to the own map.
 6. `shared_map/replication/replica_sync.py`: `MapSync.publish` puts the mark sets of the changed tiles.
 7. `swarm/bus/zenoh_intake.py`: `together` checks and decodes all waiting sets (`swarm/wire/codec.py`).
-8. `replica_sync.py`: `MapSync.tick` admits the sets within their author's quota (`author_limits.py`).
+8. `replica_sync.py`: `MapSync.tick`, called by `PlanningProcess._take_map`, admits the sets within their author's
+   quota (`author_limits.py`).
 9. `replica.py`: `MapReplica.merge` determines the winning marks (`merge.py`).
 10. `shared_map/vehicle_class_grounds.py`: `ClassMaps.apply` passes them to the map of each vehicle class.
 11. `shared_map/cost_map.py`: `CostMap.apply` changes the paces and notes the changed windows.
@@ -24,7 +25,7 @@ in a planner, 19 and 20 in the agent of the other vehicle:
 15. `planner_service/followers.py`: `Followers.touch` marks the routes that a change concerns, `due` selects them.
 16. `planner_service/tree/route_bounds.py`: `read_routes` reads their new routes.
 17. `planner_service/any_angle_routes.py`: `Puller.pull_batch` straightens them if the scenario says so.
-18. `planner_service/service.py`: `PlannerService._perform` publishes each `PushedRoute`.
+18. `planner_service/planning_process.py`: `PlanningProcess._push` publishes each `PushedRoute`.
 19. `service.py`: `AgentService.tick` takes it from the bus.
 20. `agent.py`: `Agent.route_pushed` gives it to the vehicle (`Vehicle.give_route` in `driving/driven_vehicle.py`).
 """
