@@ -114,7 +114,7 @@ def network(scenario: Scenario, *, whole: bool = True) -> Iterator[Finding]:
 
 
 def meets(scenario: Scenario) -> Iterator[Finding]:
-    """Returns True if the router that is started here is the one that the others connect to."""
+    """Endpoints to which processes connect, but at which the router that is started here does not listen."""
     listens = {endpoint.rpartition(":")[2] for endpoint in scenario.network.listen}
     for endpoint in scenario.network.connect:
         # Beyond this machine a port may be forwarded.
