@@ -27,7 +27,7 @@ from shared_map.terrain.true_ground import build_truth
 from shared_map.vehicle_class_grounds import ClassGround, class_grounds
 from swarm.bus.endpoints import host_port
 from swarm.config.contradictions import is_loopback
-from swarm.config.explain import nearest
+from swarm.config.explain import choice, nearest
 from swarm.config.input_files import FileKind, check_file, quoted, read_text, size
 from swarm.config.plugin_names import plugins_of
 from swarm.config.scenario import Scenario, TlsConfig, plan_agents
@@ -62,8 +62,7 @@ def files_named(scenario: Scenario) -> Iterator[Finding]:
 def _of_source(name: str) -> Iterator[Finding]:
     path, key = Path(name), "terrain.source"
     if not path.exists():
-        built_in = " or ".join(map(repr, BUILT_IN_TERRAINS))
-        yield failure(key, f"no such file {name}{nearest(path.name, BUILT_IN_TERRAINS)}; built in are {built_in}")
+        yield failure(key, f"no such file {name}{choice(path.name, BUILT_IN_TERRAINS, ' built in are ')}")
     elif path.is_file() and not is_terrain(path):
         yield failure(key, f"found {path.name}, expected elevation: {FILE_KINDS}, or a raster that GDAL reads")
     else:
@@ -115,7 +114,7 @@ def network(scenario: Scenario, *, whole: bool = True) -> Iterator[Finding]:
 
 
 def meets(scenario: Scenario) -> Iterator[Finding]:
-    """Returns True if the router that is started here is the one that the others connect to."""
+    """Endpoints to which processes connect, but at which the router that is started here does not listen."""
     listens = {endpoint.rpartition(":")[2] for endpoint in scenario.network.listen}
     for endpoint in scenario.network.connect:
         # Beyond this machine a port may be forwarded.

@@ -347,8 +347,10 @@ def kill(process: Annotated[str, typer.Argument(metavar="ROLE-ID")], run: RunOpt
     found = _chosen(run, only=True)
     running = found.processes()
     again = "its launcher starts it again" if found.launchers else "it had no launcher any more"
+    if not running:
+        raise ConfigError(f"run {found.name} does not run here; `swarm ps` lists those which do")
     if process not in running:
-        has = choice(process, sorted(running), " it has ") if running else "; it has none"
+        has = choice(process, sorted(running), " it has ")
         raise ConfigError(f"run {found.name} has no process {process!r} on this machine{has}")
     try:
         psutil.Process(running[process]).kill()

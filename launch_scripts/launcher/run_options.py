@@ -73,9 +73,7 @@ def scenario_path(name: str) -> Path:
         raise ConfigError(
             f"no terrain {name!r}: no such file in {path.parent.absolute()}{nearest(path.name, files)}"
         )
-    raise ConfigError(
-        f"no scenario {quoted(name)}{nearest(name, names)}; give a .toml file or one of: {', '.join(names)}"
-    )
+    raise ConfigError(f"no scenario {quoted(name)}{choice(name, names, ' give a .toml file or one of: ')}")
 
 
 def with_options(

@@ -96,7 +96,8 @@ def check_target(path: Path | None, option: str, *endings: str, force: bool = Fa
     if path.is_dir():
         raise ConfigError(f"{option} {path}: cannot write a file there, it is a folder")
     if endings and path.suffix.lower() not in endings:
-        raise ConfigError(f"{option} {path}: write {' or '.join(endings)}")
+        found = f"the ending {path.suffix!r}" if path.suffix else "no ending"
+        raise ConfigError(f"{option} {path}: found {found}, expected {' or '.join(endings)}")
     if not path.parent.is_dir():
         raise ConfigError(f"{option} {path}: cannot write there, the folder {path.parent} does not exist")
     if path.is_file() and not force:

@@ -242,9 +242,9 @@ def improve_tiles(grid, tree, tiles, scratch, schedule, most):
 
     schedule  (order, place, turn, now, stack, sets, words):
            order  int64 (n,), all tiles, those nearest the root first
-           turn   float64 (n,): of tiles beside each other the one with the least is looked at first, and totals are
-                  evaluated before the other is. All alike, all are looked at in each round
-           now    of `evaluate_totals`, the first time
+           turn   float64 (n,): of neighbouring tiles the one with the least turn is checked first, and totals are
+                  evaluated before the next. If all are equal, each round checks all tiles
+           now    argument of the first `evaluate_totals`
     """
     wanted, falls, across = tiles.wanted, tiles.falls, tiles.across
     order, place, now, sets, words = schedule.order, schedule.place, schedule.now, schedule.sets, schedule.words

@@ -205,7 +205,7 @@ class LevelGround:
 
 
 def level_ground(elevation_m: Floats) -> LevelGround:
-    """Areas that are level, or level but for the noise of a laser, with a shore above them: still water, as a rule.
+    """Level areas with a shore above them, which are usually still water. Noise of a laser may make them uneven.
 
     A file may have been resampled finer than its survey. Its shores then have ripples and slopes that no survey
     has, so patches are looked for in the cells of the survey.

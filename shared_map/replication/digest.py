@@ -30,7 +30,7 @@ _NONE = (-1, -1)
 
 
 class Ledger:
-    """The number of each set held, by author and tile, as the rows that digests are made of."""
+    """Numbers (epoch, seq) of the mark sets which a replica holds, by author and tile, as rows for digests."""
 
     def __init__(self) -> None:
         self._numbers: dict[str, dict[int, tuple[int, int]]] = {}  # author -> tile -> (epoch, seq)

@@ -40,7 +40,7 @@ _MOST_AT_ONCE = 1024
 
 
 def taken_after(channel: Any, closing: threading.Event, wait_s: float) -> list[Any]:
-    """The items in a channel, `wait_s` after the first that came; none once it is closing."""
+    """Waits for an item in a channel, and `wait_s` longer for others. Returns all; none if the channel closes."""
     first = channel.recv()
     return [] if closing.wait(wait_s) else [first, *taken_from(channel, _MOST_AT_ONCE)]
 

@@ -409,8 +409,9 @@ PLACE_TREES_BYTES = 256 << 20
 
 
 def place_trees_bytes(budget_bytes: int, classes: int, cells: int) -> int:
-    """Bytes of trees to places that are kept for each of some classes: its share, but at least two whole trees;
-    otherwise two distant askers would evict each other's for ever. One takes 5 bytes a cell, with its parents."""
+    """Returns the memory for the trees to places of one class: an equal share of the budget, but at least two whole
+    trees. With one, two distant askers would evict each other's tree for ever. A tree takes 5 bytes a cell, with
+    its parents."""
     return max(budget_bytes // classes, 2 * 5 * cells)
 
 

@@ -211,7 +211,7 @@ def driven_classes(scenario: Scenario) -> list[str]:
 
 
 def class_named(scenario: Scenario, name: str) -> ClassConfig | None:
-    """The settings of a class; None of `GROUND`. Raises ConfigError that names the classes there are."""
+    """The settings of a class; None for `GROUND`. Raises ConfigError for an unknown name."""
     if name == GROUND:
         return None
     for each in scenario.classes:

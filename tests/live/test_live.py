@@ -113,7 +113,7 @@ def test_a_run_is_found_from_any_folder_with_its_page_logs_and_pids(live: LiveSw
     for name in ("launcher", "planner-t9", "1"):
         told = swarm("kill", name)
         assert (told.returncode, told.stderr.count("\n")) == (2, 1)
-        said = f"has no process '{name}' on this machine", "; it has 'agent-a0', 'agent-a1', "
+        said = f"has no process '{name}' on this machine", "t has 'agent-a0', 'agent-a1', "
         assert all(part in told.stderr for part in said), told.stderr
 
 

@@ -329,6 +329,15 @@ def test_nobody_to_reach_is_a_sentence(world):
         open_bus(network)
 
 
+def test_each_router_that_is_not_reached_has_its_reason(world):
+    (silent,) = free_ports(1)
+    with socket.create_server(("127.0.0.1", 0)) as stranger:
+        one, other = (f"tcp/127.0.0.1:{port}" for port in (silent, stranger.getsockname()[1]))
+        network = NetworkConfig(connect=(one, other), connect_timeout_s=0.3)
+        with pytest.raises(BusError, match=f"at {one}: no process listens .*; nor at {other}: a process listens"):
+            open_bus(network)
+
+
 def test_a_port_that_is_taken_is_a_sentence(world):
     network = NetworkConfig(listen=(world.router.endpoint,))
     with pytest.raises(BusError, match=r"cannot listen on tcp/127.0.0.1:\d+: .*is the port taken"):

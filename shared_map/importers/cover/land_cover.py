@@ -218,8 +218,8 @@ def read_cover(path: Path, grid: GridSpec, config: TerrainConfig, progress: Prog
     Raises
     ------
     TerrainError
-        If the file cannot be read, holds no codes, has no place in common with the terrain, or if its table is
-        unknown or one of several: then it names the setting that answers.
+        If the file cannot be read, holds no codes or lies outside the terrain. Also if no table has its codes, or
+        several tables have them: the sentence then names the setting which chooses one.
     """
     what = f"land cover {path}"
     with opened(path, "land cover") as dataset:

@@ -42,7 +42,7 @@ class RouteRequest(Message, frozen=True, kw_only=True, tag=schema_of("route-requ
 
 
 class RouteReply(Message, frozen=True, kw_only=True, tag=schema_of("route")):
-    """A planner's answer.
+    """A planner's reply, with a route from each start.
 
     incarnation  of the planner
     map_version  number of changes of its replica

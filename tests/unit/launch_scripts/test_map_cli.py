@@ -73,7 +73,9 @@ def test_a_geotiff_says_where_and_what(tmp_path: Path, swarm: Swarm) -> None:
 
 def test_what_cannot_be_read_or_written_is_said_in_a_sentence(tmp_path: Path, swarm: Swarm) -> None:
     store = stored(tmp_path / "map.sqlite", SETS)
-    assert ": write .json or .tif" in swarm("marks export", store, tmp_path / "map.gpx")[2]
+    assert (
+        "found the ending '.gpx', expected .json or .tif" in swarm("marks export", store, tmp_path / "map.gpx")[2]
+    )
     assert "cannot write" in swarm("marks export", store, tmp_path / "no" / "map.json")[2]
 
 

@@ -22,7 +22,7 @@ from support.swarm_model import SwarmModel
 from shared_map.keeper.mark_store import KeeperStore
 from shared_map.replication.replica import MapReplica
 from swarm.bus.bus import LinkChanged
-from swarm.client import BusError, ConfigError, Frame, Route, RunMismatchError, Stream
+from swarm.client import BusError, ConfigError, Frame, Route, RunMismatchError, Stream, connect
 from swarm.client.connected_swarm import agreed
 from swarm.client.observer import marked
 from swarm.client.vehicle import OwnMarks, Vehicle
@@ -678,3 +678,11 @@ def test_a_stream_is_read_by_a_thread_and_ends_when_closed() -> None:
     for n in range(5):
         bounded.put(n)
     assert (bounded.next(0), bounded.next(0), bounded.next(0)) == (3, 4, None)
+
+
+def test_a_tls_endpoint_needs_all_three_files() -> None:
+    for files in ({}, {"ca": "ca.pem"}, {"certificate": "rover.pem", "key": "rover.key"}):
+        with pytest.raises(
+            ConfigError, match=r"tls/10\.0\.0\.1:7447': a tls/ endpoint needs ca, certificate and key"
+        ):
+            connect("tls/10.0.0.1:7447", **files)
