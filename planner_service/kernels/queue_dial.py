@@ -285,6 +285,19 @@ def grow_by_buckets(grid, cost, buckets, scratch, state, askers, most, aim):
     return current if current <= 1 << 20 or waiting == _ZERO else layout.TOO_FINE
 
 
+@kernel("void(f4[::1], u4[::1], i8[::1], i8)")
+def begin(cost, touched, state, root):
+    """Begins the growth of a padded root, or none if that is -1. The cells which the last growth touched cost inf
+    again; those that are lethal by now keep WALL."""
+    for i in range(state[3]):
+        v = np.uint64(touched[i])
+        c = cost[v]
+        cost[v] = layout.INF if c >= _ZERO32 else c
+    state[0], state[1], state[2], state[3] = 0, 0, 0, 0
+    if root >= 0:
+        cost[root], touched[0], state[3] = _ZERO32, root, 1
+
+
 @kernel(f"({layout.GRID}, f4[::1], {layout.BUCKETS}, {_SCRATCH}, i8[::1], {layout.BOX}, f4[:, ::1], i8)")
 def resume(grid, cost, buckets, scratch, state, box, crop, first):
     """Goes back to a tree that was cut out (see `route_kernels`): to its costs in buckets below `first`, which are

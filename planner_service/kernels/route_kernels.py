@@ -343,6 +343,76 @@ def point_routes(grid, cost, root, starts, parent, pointed, count):
     return count
 
 
+@kernel("(f4[::1], f4[::1], i8, i8, i8[::1], i8[::1])")
+def open_cells(cell_cost, cost, stride, root, asked, cells):
+    """Writes those of some numbers which are passable cells of the grid to `cells` (n,), padded.
+
+    cost  of a growth that has stopped; it may be empty
+    Returns how many they are; how many of them have no cost; and how far the farthest is from the padded root,
+    in rows or columns.
+    """
+    cols = stride - 2
+    most = (cell_cost.size // stride - 2) * cols
+    row, col = root // stride, root % stride
+    count = unknown = away = 0
+    for i in range(asked.size):
+        down, across = asked[i] // cols + 1, asked[i] % cols + 1
+        v = down * stride + across
+        if asked[i] >= 0 and asked[i] < most and cell_cost[v] < INF:
+            cells[count] = v
+            count += 1
+            unknown += cost.size == 0 or not cost[v] < INF
+            away = max(away, abs(down - row), abs(across - col))
+    return count, unknown, away
+
+
+@helper
+def _driven_to(grid, parent, start, root):
+    """float64, s: what it costs to drive from a padded cell along the parents as far as beside the root of another
+    tree, and then there; inf if they lead past it, or over what is lethal or shut by now."""
+    cell_cost, offsets, _, rule, corners = grid
+    lengths = np.float64(1.0), np.float64(diagonal_length(rule))
+    v, driven, least = start, 0.0, np.inf
+    for _ in range(parent.size):
+        if v == root:
+            return driven
+        for k in range(8):
+            if v + offsets[k] == root and (corners or not k & 1 or not is_shut(cell_cost, offsets, v, k)):
+                least = min(least, driven + np.float64(cell_cost[root]) * lengths[k & 1])
+        way = parent[v]
+        if way == NONE or (way & 1 and not corners and is_shut(cell_cost, offsets, v, way)):
+            break
+        v += offsets[way]
+        driven += np.float64(cell_cost[v]) * lengths[way & 1]
+    return least
+
+
+@kernel(f"({GRID}, f4[::1], u1[::1], i8[::1], i8, f8)")
+def farthest_of(grid, cost, parent, askers, root, between):
+    """Upper bound of what the cheapest ways from padded, passable cells to a new root cost, before any growth.
+
+    cost     of an older root's tree; inf where a cell has none
+    parent   of any tree, which the map's changes since do not make wrong here; it may be empty
+    between  s; the cheapest way from that older root to the new one costs no more. inf: `cost` tells nothing
+    Returns the padded rows and columns of a box that holds the cells, row1 and col1 in it; and what none of their
+    ways exceeds, s.
+    """
+    stride = grid[2]
+    row0 = col0 = np.int64(cost.size)
+    row1 = col1 = np.int64(0)
+    most = 0.0
+    for i in range(askers.size):
+        start = askers[i]
+        row = start // stride
+        col = start - row * stride
+        row0, row1 = min(row0, row), max(row1, row)
+        col0, col1 = min(col0, col), max(col1, col)
+        known = np.float64(cost[start]) + between
+        if not known <= most:
+            most = max(most, min(known, _driven_to(grid, parent, start, root)))
+    return row0, col0, row1, col1, most
+
+
 @kernel(f"({GRID}, {BOX}, f4[::1], f4[::1], UniTuple(i8, 3), u1[::1])")
 def walk_by_costs(grid, box, crop, time_cost, ends, directions):
     """Writes the directions of a cheapest route by costs alone; of equals the first as in `parents_from_costs`.
