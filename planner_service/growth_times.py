@@ -94,8 +94,8 @@ class GrowthTimes:
         """Moves in the last `_TICKS` ticks or so; the value when the row was chosen."""
         self._ticks = 0
         self._near_cells, self._near_is_new = math.inf, False
-        self._unmeasured = {"exact": 0, "bounded": 0}
-        """Moves of the target since one was followed so."""
+        self._kind, self._in_a_row = "", 0
+        """Kind of the last update that was observed, and the number of equal ones before it."""
         self._choose()
 
     def set_budget(self, cpu_budget: float) -> None:
@@ -135,13 +135,15 @@ class GrowthTimes:
 
     def observe(self, kind: str, took_ns: int) -> None:
         """CPU time (ns) of a growth or an exact move, by the kind of update. A simulation does not call it."""
-        for row, moves in self._unmeasured.items():
-            self._unmeasured[row] = 0 if row == kind else moves + 1
-        if self._unmeasured["exact"] > TRIED_AFTER:
-            self.exact_ns = min(self.exact_ns, self._model_exact_ns)
-            self._exact_took_ns.clear()
-        if self._unmeasured["bounded"] > TRIED_AFTER:
-            self._expect_near(min(self._near_whole_ns, self._grid.cells * MODEL_NEAR_NS_PER_CELL))
+        self._in_a_row = self._in_a_row + 1 if kind == self._kind else 0
+        self._kind = kind
+        if self._in_a_row == TRIED_AFTER:
+            self._in_a_row = 0
+            if kind == "exact":
+                self._expect_near(min(self._near_whole_ns, self._grid.cells * MODEL_NEAR_NS_PER_CELL))
+            else:
+                self.exact_ns = min(self.exact_ns, self._model_exact_ns)
+                self._exact_took_ns.clear()
         observers = {"exact": self.observe_exact_ns, "bounded": self._observe_near_ns}
         observers.get(kind, self.observe_full_ns)(took_ns)
 

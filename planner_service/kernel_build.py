@@ -56,7 +56,7 @@ FIRST: tuple[Kernel | StepKernel, ...] = (
     parents_from_costs.untie_parents,
     StepKernel(route_kernels.box_of, None),
     StepKernel(route_kernels.point_routes, None),
-    StepKernel(route_kernels.farthest_of, None),
+    StepKernel(route_kernels.find_aim, None),
     StepKernel(queue_dial.begin, None),
     route_kernels.open_cells,
     cell_costs.pad_cell_costs,

@@ -299,8 +299,7 @@ class TargetTree:
             return RouteBatch.none(asked, NO_TARGET)
         self._reach(asked)
         routes = read_routes(self._tree, self._bounds, asked, max_cells)
-        if not self._is_whole:
-            unknown = routes.statuses == UNREACHABLE
+        if not self._is_whole and (unknown := routes.statuses == UNREACHABLE).any():
             routes.statuses[unknown] = NO_TARGET
             routes.lower_bound_s[unknown] = self._tree.bound * self.cost_grid.time_share
         return routes

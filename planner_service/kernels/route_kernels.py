@@ -387,30 +387,57 @@ def _driven_to(grid, parent, start, root):
     return least
 
 
-@kernel(f"({GRID}, f4[::1], u1[::1], i8[::1], i8, f8)")
-def farthest_of(grid, cost, parent, askers, root, between):
-    """Upper bound of what the cheapest ways from padded, passable cells to a new root cost, before any growth.
+_AIMED = 4.0
+"""No cells are left out while the rest of the ways may be this many times as long as that from the root straight to
+the askers: to find out which takes longer than to grow them there."""
 
-    cost     of an older root's tree; inf where a cell has none
-    parent   of any tree, which the map's changes since do not make wrong here; it may be empty
-    between  s; the cheapest way from that older root to the new one costs no more. inf: `cost` tells nothing
-    Returns the padded rows and columns of a box that holds the cells, row1 and col1 in it; and what none of their
-    ways exceeds, s.
+
+@helper
+def _sort(askers, boxes):
+    """Sorts cells by column 4 of their rows (D. L. Shell, Communications of the ACM 2(7), 1959, 30-32)."""
+    gap = askers.size // 2
+    while gap > 0:
+        for i in range(gap, askers.size):
+            cell, bound, j = askers[i], boxes[i, 4], i
+            while j >= gap and boxes[j - gap, 4] > bound:
+                askers[j], boxes[j, 4] = askers[j - gap], boxes[j - gap, 4]
+                j -= gap
+            askers[j], boxes[j, 4] = cell, bound
+        gap //= 2
+
+
+@kernel(f"({GRID}, f4[::1], u1[::1], i8[::1], i8, UniTuple(f8, 2), f4[:, ::1])")
+def find_aim(grid, cost, parent, askers, root, known, boxes):
+    """Finds which cells a growth to a new root may leave out, by upper bounds of what the cheapest ways cost.
+
+    cost    of an older root's tree; inf where a cell has none
+    parent  of any tree, which the map's changes since do not make wrong here; it may be empty
+    askers  padded, passable cells; sorted by their upper bounds
+    known   s; what the cheapest way from that older root to the new one costs at most (inf: `cost` tells nothing),
+            and the lowest cell cost
+    boxes   (n, 5), written: for each asker and those behind it, the padded rows and columns (row0, col0, row1,
+            col1) in which they lie, row1 and col1 among them; and the cost, s, from which on it pays to leave out
+            cells
+    Returns what none of the ways exceeds, s: inf if nothing is known.
     """
     stride = grid[2]
+    between, lowest = known
+    for i in range(askers.size):
+        boxes[i, 4] = min(np.float64(cost[askers[i]]) + between, _driven_to(grid, parent, askers[i], root))
+    _sort(askers, boxes)
+    most = np.float64(boxes[askers.size - 1, 4])
+    most *= 1.0 + (most / lowest + 8.0) * 2.0**-22  # costs are rounded once for each step
+    home_row, home_col = root // stride, root % stride
     row0 = col0 = np.int64(cost.size)
     row1 = col1 = np.int64(0)
-    most = 0.0
-    for i in range(askers.size):
-        start = askers[i]
-        row = start // stride
-        col = start - row * stride
+    for i in range(askers.size - 1, -1, -1):
+        row, col = askers[i] // stride, askers[i] % stride
         row0, row1 = min(row0, row), max(row1, row)
         col0, col1 = min(col0, col), max(col1, col)
-        known = np.float64(cost[start]) + between
-        if not known <= most:
-            most = max(most, min(known, _driven_to(grid, parent, start, root)))
-    return row0, col0, row1, col1, most
+        apart = max(max(row0 - home_row, home_row - row1), max(col0 - home_col, home_col - col1))
+        boxes[i, 0], boxes[i, 1], boxes[i, 2], boxes[i, 3] = row0, col0, row1, col1
+        boxes[i, 4] = most - _AIMED * lowest * apart
+    return most
 
 
 @kernel(f"({GRID}, {BOX}, f4[::1], f4[::1], UniTuple(i8, 3), u1[::1])")

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from planner_service.kernels import queue_dial
 from planner_service.kernels.layout import NONE, TOO_FINE, WALL
-from planner_service.kernels.route_kernels import box_of, farthest_of, stays_exact, walk_by_costs
+from planner_service.kernels.route_kernels import box_of, find_aim, stays_exact, walk_by_costs
 from planner_service.tree.cost_changes import Cells, Changes
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.queue_choice import NARROW
@@ -19,9 +19,6 @@ from shared_map.array_files import Floats
 MOST_BUCKETS = 1 << 12
 """A growth can stop if its narrow buckets are at most this number: passing that many empty buckets costs less than
 growing a whole map. With more, each growth is whole."""
-_AIMED = 4.0
-"""No growth aims at a way of more than this many times the straight one at the lowest cost: to find which cells
-may be left out takes longer than to grow them there."""
 
 
 class CutTree(NamedTuple):
@@ -84,7 +81,7 @@ class PartialGrowth:
         self._grid = cost_grid
         self._width, self._circle = 0.0, 0
         self._scratch: queue_dial.Scratch | None = None
-        self._state = np.zeros(4, np.int64)
+        self._state = np.zeros(5, np.int64)
         self._mark = np.zeros(cost_grid.size, np.uint8)
         self.cost: Floats = np.empty(0, np.float32)
         """float32, padded, s: of the tree in hand; inf where a cell has none, WALL where it is lethal."""
@@ -140,31 +137,27 @@ class PartialGrowth:
         self._find_bound()
 
     def aim_at(self, askers: Cells, root: int, parent: NDArray[np.uint8]) -> queue_dial.Aim:
-        """Returns the aim of the next growth, from a padded, passable root to such cells. None costs more than
-        along the parents to a cell beside that root, or over the tree in hand and its root. `NO_AIM` if neither is
-        known, or would leave out too few cells."""
-        grid, lowest = self._grid, self._grid.lowest_cell_cost
+        """Returns the aim of the next growth, from a padded, passable root to such cells, which it sorts. None
+        costs more than along the parents to a cell beside that root, or over the tree in hand and its root. Where
+        neither is known, no cells are left out."""
+        grid, between = self._grid, math.inf
         if not askers.size:
             return queue_dial.NO_AIM
-        between = math.inf
         if self.root >= 0 and self.bound >= 0:
             back = float(grid.cell_cost[root] + self.cost[root] - grid.cell_cost[self.root])
             between = back * grid.dearest_step
         cost = self.cost if self.root >= 0 else grid.cell_cost
-        row0, col0, row1, col1, most = farthest_of(grid.padded, cost, parent, askers, root, between)
-        most *= 1.0 + (most / lowest + 8.0) * 2.0**-22  # costs are rounded once for each step
-        row, col = divmod(root, grid.stride)
-        if not most <= _AIMED * lowest * max(row0 - row, row - row1, col0 - col, col - col1):
-            return queue_dial.NO_AIM
-        return float(row0), float(col0), float(row1), float(col1), lowest, most
+        known, boxes = (between, grid.lowest_cell_cost), np.empty((askers.size, 5), np.float32)
+        most = find_aim(grid.padded, cost, parent, askers, root, known, boxes)
+        return grid.lowest_cell_cost, most, boxes
 
     def go_on(self, askers: Cells, most: int, aim: queue_dial.Aim = queue_dial.NO_AIM) -> int:
         """Grows until these padded, passable cells have a cost, `most` more cells have one, or no cell is left.
         Returns how many more have one; -1 if costs became too large for float32: then a whole growth is left.
 
-        aim  which cells are left out. After such a growth, one that goes on begins again
+        aim  which cells are left out. After a growth that left out some, one that goes on begins again
         """
-        if self.bound == 0.0 and self.touched > 1:
+        if self._state[4] and self.touched > 1:
             self.begin(self.root)
         assert self._scratch is not None
         before, buckets = self.touched, (self._width, self._circle)
@@ -172,11 +165,11 @@ class PartialGrowth:
         last = queue_dial.grow_by_buckets(*grown, askers, most, aim)
         if last == TOO_FINE:
             return -1
-        self._find_bound(aim is not queue_dial.NO_AIM)
+        self._find_bound()
         return self.touched - before
 
-    def _find_bound(self, aimed: bool = False) -> None:
-        self.bound = 0.0 if aimed else self.reach if self._state[1] else math.inf
+    def _find_bound(self) -> None:
+        self.bound = 0.0 if self._state[4] else self.reach if self._state[1] else math.inf
 
     def cut(self) -> CutTree:
         """Returns the tree in hand, as an array of its own with a rim of cells without a cost. Then none is

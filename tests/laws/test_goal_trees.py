@@ -48,6 +48,7 @@ def test_a_growth_that_stops_is_exact_where_it_was_and_bounds_the_rest(rules: di
         farthest, asker = 0.0, goal
         for _ in range(12):
             changes, most, aim = rng.random() < 0.2, int(rng.choice([1 << 40, 1, 30])), NO_AIM
+            askers = None
             if changes:
                 growth.learn(ground.apply(pace, [marked(rng, pace, 2.0) for _ in range(20)]))
             if np.isfinite(pace.flat[goal]) and rng.random() < 0.7:  # else its parents are of an older map and root
@@ -57,22 +58,26 @@ def test_a_growth_that_stops_is_exact_where_it_was_and_bounds_the_rest(rules: di
             if changes or rng.random() < 0.3:  # the target moves
                 beside = [cell for _, cell in ground.grid.neighbours(goal) if np.isfinite(pace.flat[cell])]
                 goal = int(rng.choice(beside or [open_cell(rng, pace)]))
-                aim = growth.aim_at(np.array([ground.pad(asker)]), ground.pad(goal), ways.parent)
+                more = [open_cell(rng, pace) for _ in range(rng.integers(0, 4))]
+                askers = ground.pad_all(np.array([asker, *more]))
+                aim = growth.aim_at(askers, ground.pad(goal), ways.parent)
                 growth.begin(ground.pad(goal))
                 farthest, best = 0.0, naive.cost_to_go(pace, goal, **rules).reshape(-1)
             elif rng.random() < 0.3:  # a tree that was put down goes on like one in hand
                 growth.resume(growth.cut(), np.inf)
-            growth.go_on(np.array([ground.pad(asker)]), most, aim)
-            aimed += aim is not NO_AIM
+            askers = np.array([ground.pad(asker)]) if askers is None else askers
+            growth.go_on(askers, most, aim)
+            aimed += growth.bound == 0
             cost = costs_of(growth, pace)
             has = np.isfinite(cost)
             assert has.sum() == growth.touched
             np.testing.assert_allclose(cost[has], best[has], rtol=ROUNDING)
             left = ~has & np.isfinite(pace.reshape(-1))
             assert (best[left] >= growth.bound * (1 - ROUNDING)).all()
-            assert has[asker] or most < 1 << 40 or best[asker] == np.inf
+            cells = np.flatnonzero(np.isin(ground.pad_all(np.arange(pace.size)), askers))
+            assert has[cells].all() or most < 1 << 40 or np.isinf(best[cells]).any()
             # It goes no farther than the bucket of the farthest asker.
-            farthest = max(farthest, best[asker])
+            farthest = max(farthest, best[cells].max())
             if 0 < growth.bound < np.inf:
                 assert growth.bound <= farthest * (1 + ROUNDING) + ground.lowest_cell_cost
                 assert (cost[has] <= growth.bound * (1 + ROUNDING)).all()
