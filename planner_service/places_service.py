@@ -40,7 +40,7 @@ from swarm.wire.messages.orders import Obey
 from swarm.wire.messages.planning import PlaceRouteReply, PlaceRouteRequest, PlaceStatus, PushedRoute
 from swarm.wire.messages.vehicles import Chasers
 from swarm.wire.route_columns import Route, RouteBatch, RouteStatus
-from swarm.wire.topics import PLACE_ROUTE, SENT, asker_of, is_own
+from swarm.wire.topics import PLACE_ROUTE, SENT, asker_of, rank_of
 
 log = logging.getLogger(__name__)
 
@@ -274,7 +274,7 @@ class PlacesService(PlanningProcess):
         away = (max(abs(cell // cols - row), abs(cell % cols - col)) for cell in request.cells)
         cells = 3 * max(away, default=0) ** 2
         price = _BASE_PRICE + len(request.cells) + min(cells, SLICE_CELLS) // _CELLS_OF_A_PRICE
-        question.turn = 2 * (not is_own(question.asker)) + (cells > SLICE_CELLS)
+        question.turn = 2 * rank_of(question.asker) + (cells > SLICE_CELLS)
         flow = f"{question.asker} {question.turn}"
         for dropped in self._waiting.put(flow, question, price=price, rank=question.turn):
             self._drop(dropped, "too many questions wait here already: ask again in a second")
