@@ -77,6 +77,8 @@ class ZenohAnswerer:
         try:
             check_size(self.size, topic.ask_bytes)
             self.timeout_s = zenoh_intake.timeout_of(parameters.get(TIMEOUT_PARAMETER) or "")
+            if topic.costly:
+                self.fields = proven_asker(self.fields, bus.intake.proves(query, self._asked))
         except ProtocolError as error:
             self.fault = error
 
@@ -96,12 +98,6 @@ class ZenohAnswerer:
             self.end()
             return None
         return Asked(topic, self.fields, request, self)
-
-    def prove(self) -> None:
-        """Marks the asker if no code proves its name."""
-        query, intake = self._query, self._bus.intake
-        assert query is not None
-        self.fields = proven_asker(self.fields, intake.proves(query, self._asked))
 
     def waited_s(self) -> float:
         return time.monotonic() - self._arrived_s
@@ -323,8 +319,6 @@ class ZenohBus:
             elif answerer.fault is not None:
                 answerer.decoded()  # which rejects it
             else:
-                if topic.costly:
-                    answerer.prove()
                 post(Undecoded(topic, answerer, answerer.decoded, asker_in(answerer.fields)))
 
         expression = self._pattern(topic, fields)

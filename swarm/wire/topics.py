@@ -543,7 +543,8 @@ UNPROVEN = "~"
 
 def proven_asker(fields: Mapping[str, str], proven: bool) -> Mapping[str, str]:
     """The fields of the key of a question, with the asker's name marked if it is not proven."""
-    return fields if proven or "asker" not in fields else {**fields, "asker": UNPROVEN + fields["asker"]}
+    name = fields.get("asker", "*")
+    return fields if proven or name == "*" else {**fields, "asker": UNPROVEN + name}
 
 
 def rank_of(asker: str) -> int:
