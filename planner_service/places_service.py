@@ -13,6 +13,7 @@ asked.
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
@@ -41,7 +42,7 @@ from swarm.wire.messages.orders import Obey
 from swarm.wire.messages.planning import PlaceRouteReply, PlaceRouteRequest, PlaceStatus, PushedRoute
 from swarm.wire.messages.vehicles import Chasers
 from swarm.wire.route_columns import Route, RouteBatch, RouteStatus
-from swarm.wire.topics import PLACE_ROUTE, SENT, asker_of, is_own
+from swarm.wire.topics import PLACE_ROUTE, SENT, asker_of, rank_of
 
 log = logging.getLogger(__name__)
 
@@ -281,21 +282,19 @@ class PlacesService(PlanningProcess):
         away = (max(abs(cell // cols - row), abs(cell % cols - col)) for cell in request.cells)
         cells = 3 * max(away, default=0) ** 2
         price = _BASE_PRICE + len(request.cells) + min(cells, SLICE_CELLS) // _CELLS_OF_A_PRICE
-        question.rank = int(not is_own(question.asker))
+        question.rank = rank_of(question.asker)
         queue = self._far if cells > SLICE_CELLS else self._near
         for dropped in queue.put(question.asker, question, price=price, rank=question.rank):
             self._drop(dropped, "too many questions wait here already: ask again in a second")
 
     def _next(self) -> _Question | None:
         """The question that has the next slice. Of those of one rank, near goals come first, but not for ever."""
-        goes_on = bool(self._going_on) and not self._far.comes_before(self._going_on[-1].rank)
-        if goes_on or self._far:
-            far = self._going_on[-1].rank if goes_on else int(not self._far.comes_before(1))
-            near = int(not self._near.comes_before(1))
-            if not self._near or (far, _MOST_NEAR) <= (near, self._near_in_a_row):
-                self._near_in_a_row = 0
-                return self._going_on.pop() if goes_on else self._far.take()
-            self._near_in_a_row += 1
+        goes_on = self._going_on[-1].rank if self._going_on else math.inf
+        far, near = min(goes_on, self._far.first_rank), self._near.first_rank
+        if far < near or (far == near and self._near_in_a_row >= _MOST_NEAR):
+            self._near_in_a_row = 0
+            return self._going_on.pop() if goes_on == far and self._going_on else self._far.take()
+        self._near_in_a_row += 1
         return self._near.take()
 
     def _go_on(self) -> None:
