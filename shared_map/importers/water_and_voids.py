@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shared_map.array_files import Bools, Floats
-from shared_map.importers.survey_cells import surveyed
+from shared_map.importers.survey_cells import MOSTLY, ROUNDINGS_M, surveyed
 from shared_map.terrain.row_bands import neighbours
 from swarm.config.ground import TerrainConfig
 
@@ -186,8 +186,8 @@ _TOLD_SHARE = 0.001
 """The note has one decimal of a percent: a smaller share would be shown as 0.0 or 0.1 %."""
 _MUCH_WATER = 0.05
 """Share of the terrain from which on many small lakes are doubted: filled sinks. Chosen, not measured."""
-_ROUNDINGS_M, _LEAST_HEIGHTS, _MOSTLY = (1.0, 0.5, 0.25, 0.1), 5, 0.9
-"""Usual roundings of heights. They count if 0.9 of all level cells, at five heights or more, lie on one."""
+_LEAST_HEIGHTS = 5
+"""A rounding counts if most level cells, at so many heights or more, lie on it."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -266,9 +266,9 @@ def _rounded_m(found: Patches) -> float:
     heights, cells = found.height_m[1:].astype(np.float64), found.cells[1:]
     if np.unique(np.round(heights, 2)).size < _LEAST_HEIGHTS:
         return 0.0
-    for step_m in _ROUNDINGS_M:
+    for step_m in ROUNDINGS_M:
         off_m = np.abs(heights - np.rint(heights / step_m) * step_m)
-        if cells[off_m < 2 * _SAME_M].sum() > _MOSTLY * cells.sum():
+        if cells[off_m < 2 * _SAME_M].sum() > MOSTLY * cells.sum():
             return step_m
     return 0.0
 

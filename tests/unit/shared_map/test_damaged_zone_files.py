@@ -357,8 +357,9 @@ def test_a_stated_extent_is_closed_up_to_its_edge(tmp_path: Path, tags: dict[str
 
 @pytest.mark.parametrize(
     "tags",
-    [{"radius": "wide"}, {"radius_nm": 3}, {"Radius": -5}, {"width": 20_000}, {"radius": [1, 2]}, {"buffer_m": 50}],
-)
+    [{"radius": "wide"}, {"radius_nm": 3}, {"Radius": -5}, {"width": 20_000}, {"radius": [1, 2]}, {"buffer_m": 50},
+        {"range": 80}, {"Dist": 80.0}, {"safetyDistance": "80 m"}, {"RANGE_M": 8}, {"BUFF_DIST": 8}, {"rayon": 80}],
+)  # fmt: skip
 def test_an_extent_that_cannot_be_read_is_refused_by_name(tmp_path: Path, tags: dict[str, Any]) -> None:
     file = geojson(tmp_path / "a.geojson", [feature(shapely.Point(15.5, 14.5), **tags)])
     words = (
@@ -366,6 +367,15 @@ def test_an_extent_that_cannot_be_read_is_refused_by_name(tmp_path: Path, tags: 
     )
     with pytest.raises(TerrainError, match=words):
         painted([ZoneConfig(kind="forbidden", file=file)])
+
+
+@pytest.mark.parametrize("tags", [{"range": 80}, {"distance": "far"}, {"dist": 0}, {"orange": 80}])
+def test_another_number_of_a_line_or_of_a_point_with_a_width_is_no_extent(tmp_path: Path, tags: dict) -> None:
+    line = geojson(tmp_path / "line.geojson", [feature(shapely.LineString([(5, 9.5), (25, 9.5)]), **tags)])
+    pace, _ = painted([ZoneConfig(kind="forbidden", file=line)])
+    assert (pace != np.float32(0.1)).sum() < 30
+    point = geojson(tmp_path / "point.geojson", [feature(shapely.Point(15.5, 14.5), **tags)])
+    assert closed_by(point, "forbidden").sum() == 1
 
 
 def test_a_fence_keeps_in_and_keeps_out(tmp_path: Path) -> None:
