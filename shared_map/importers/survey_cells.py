@@ -52,8 +52,8 @@ _SMOOTH, _BEND = 1e-7, (1.0, -2.0, 1.0)
 _AT_ONCE = 256
 """Columns that are solved together: their sums take some megabytes."""
 ROUNDINGS_M, MOSTLY, _OFF = (1.0, 0.5, 0.25, 0.1), 0.9, 0.125
-"""Usual roundings of heights. A survey has one if so many heights lie on it, but for this share of it: errors of the
-sums are smaller."""
+"""Usual roundings of heights. A survey has one if so many heights lie within this share of it: errors of the sums
+are smaller."""
 
 
 def _linear(t: _Doubles) -> _Doubles:

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import hashlib
 from dataclasses import dataclass, field, replace
+from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -76,9 +77,13 @@ class Terrain:
 
 
 def build_terrain(scenario: Scenario, progress: Progress = no_progress, vehicle_class: str = GROUND) -> Terrain:
-    """The terrain of a scenario, for one of its classes of vehicles. Raises TerrainError with one sentence."""
+    """The terrain of a scenario, for one of its classes of vehicles. Raises TerrainError with one sentence, or
+    ConfigError on a setting that no file may have."""
     from shared_map.importers.terrain_sources import load_source
+    from swarm.config.toml_files import checked
 
+    if isinstance(scenario.terrain.source, str | PathLike):  # of an array the reader says what to do
+        scenario = checked(scenario)
     try:
         source = load_source(scenario.terrain, scenario.seed, progress)
         return _built(of_class(scenario, vehicle_class), source, progress, scenario.cost)

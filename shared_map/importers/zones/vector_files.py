@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from pyogrio.raw import read
 
 from shared_map.importers.georeference import system_named
-from shared_map.importers.raster_files import DRAWINGS, beginning, faults_of, number_of, other_format
+from shared_map.importers.raster_files import DRAWINGS, beginning, faults_of, is_raster, number_of, other_format
 from shared_map.importers.zones.zone_files import IN_ARCHIVES, Kind, kind_of
 from swarm.config.explain import nearest
 from swarm.config.input_files import FileKind, check_bytes, read_bytes, size
@@ -201,6 +201,8 @@ def _source(path: Path, what: str) -> tuple[str | bytes, Kind]:
     if kind is None:
         if path.suffix.lower() in (".dbf", ".shx", ".prj"):
             raise TerrainError(f"{what} is a part of a Shapefile; name the .shp beside it")
+        if is_raster(path):
+            raise TerrainError(f"{what} is read as a raster, which goes with kind pace or factor of a scenario")
         neither = "GeoJSON, GeoPackage, Shapefile, FlatGeobuf, KML, GPX, OSM XML, .plan nor .waypoints"
         raise TerrainError(f"{what} {other_format(head, f'is neither {neither}, nor a .zip of one')}")
     absolute = path.resolve()
@@ -349,6 +351,8 @@ def checked_json(data: bytes, kind: Kind, what: str, name: str) -> bytes:
             fence = msgspec.json.decode(text, type=_Plan).geoFence
             areas = [_area(each.polygon, each.inclusion) for each in fence.polygons]
             discs = [_disc(each.circle.center, each.circle.radius, each.inclusion) for each in fence.circles]
+            if not areas + discs:
+                raise TerrainError(f"{what} holds no fence")
             return _collection([*areas, *discs], name)
         if document.type == "FeatureCollection" and not document.features:
             raise TerrainError(f"{what} holds no feature")

@@ -349,7 +349,7 @@ def outlines_of(zone: ZoneConfig, grid: GridSpec, most_corners: int) -> list[lis
         A scenario's zone would be refused with the same file, or an area has more than `most_corners` corners, or
         there are too many areas.
     """
-    what = f"zone {zone.file}"
+    what = f"zone {Path(zone.file or '')}"
     return _outlines(draw_zone(zone, grid, what), grid, what, most_corners)
 
 

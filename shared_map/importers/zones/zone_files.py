@@ -99,7 +99,7 @@ def burn_zone(zone: ZoneConfig, grid: GridSpec, where: str) -> Burnt:
     """The cells of a zone that a file draws. Raises TerrainError with one sentence, which `where` begins."""
     path = Path(zone.file or "")
     what = f"{where} {path}"
-    if not is_vector(path) and is_raster(path):
+    if zone.kind in ("pace", "factor") and not is_vector(path) and is_raster(path):
         return _friction(zone, path, grid, where)
     from shared_map.importers.zones.burn_shapes import burn
     from shared_map.importers.zones.zone_features import closed_shapes, draw_zone
@@ -114,8 +114,6 @@ def burn_zone(zone: ZoneConfig, grid: GridSpec, where: str) -> Burnt:
 def _friction(zone: ZoneConfig, path: Path, grid: GridSpec, where: str) -> Burnt:
     """A raster of paces or factors. Infinite is lethal; where there is no value the ground is left as it is."""
     what = f"{where} {path}"
-    if zone.kind not in ("pace", "factor"):
-        raise TerrainError(f"{what} is read as a raster, which goes with kind pace or factor, found {zone.kind!r}")
     given = [key for key in ("layer", "attribute", "width_m", "classes", "value") if getattr(zone, key)]
     if given:
         raise TerrainError(f"{what} is a raster, which has no {given[0]}")

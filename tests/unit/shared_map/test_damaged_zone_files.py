@@ -378,6 +378,23 @@ def test_another_number_of_a_line_or_of_a_point_with_a_width_is_no_extent(tmp_pa
     assert closed_by(point, "forbidden").sum() == 1
 
 
+@pytest.mark.parametrize(
+    ("name", "text", "words"),
+    [
+        ("a.csv", 'id,WKT\n1,"POLYGON ((9 47, 9.1 47, 9 47.1, 9 47))"\n', r"shapes as text \(WKT\)"),
+        ("a.kml", '<!DOCTYPE kml [<!ENTITY a "b">]><kml><Document/></kml>', "an XML with entities of its own"),
+        ("a.plan", plan([]), "holds no fence"),
+        ("a.asc", "ncols 1\nnrows 1\nxllcorner 0\nyllcorner 0\ncellsize 1\n1\n", "is read as a raster, which goes"),
+    ],
+)
+def test_both_doors_say_what_a_file_is(tmp_path: Path, name: str, text: str, words: str) -> None:
+    (tmp_path / name).write_text(text)
+    zone = ZoneConfig(kind="forbidden", file=str(tmp_path / name))
+    for door in (lambda: painted([zone]), lambda: outlines_of(zone, UTM, 256)):
+        with pytest.raises(TerrainError, match=words):
+            door()
+
+
 def test_a_fence_keeps_in_and_keeps_out(tmp_path: Path) -> None:
     kept = ~shapely.contains(AREA, squares())
     inside = {"inclusion": True, "polygon": LATLON}
