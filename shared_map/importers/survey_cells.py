@@ -51,9 +51,8 @@ _SMOOTH, _BEND = 1e-7, (1.0, -2.0, 1.0)
 """Weight of bends of the survey: it moves heights by less than a millimetre where the sums determine them."""
 _AT_ONCE = 256
 """Columns that are solved together: their sums take some megabytes."""
-ROUNDINGS_M, MOSTLY, _OFF = (1.0, 0.5, 0.25, 0.1), 0.9, 0.125
-"""Usual roundings of heights. A survey has one if so many heights lie within this share of it: errors of the sums
-are smaller."""
+_ROUNDINGS_M, _MOSTLY, _OFF = (0.1, 0.25, 0.5, 1.0), 0.9, 0.125
+"""Usual roundings of heights. The coarsest that fits counts: 0.9 of all heights lie within an eighth of it."""
 
 
 def _linear(t: _Doubles) -> _Doubles:
@@ -130,11 +129,10 @@ def surveyed(elevation_m: Floats) -> tuple[Floats, NDArray[np.intp], NDArray[np.
         for line in (0, -1):
             heights_m[line] = np.minimum.reduceat(filled_m[line], starts[1])
             heights_m[:, line] = np.minimum.reduceat(filled_m[:, line], starts[0])
-    for step_m in ROUNDINGS_M:
+    for step_m in _ROUNDINGS_M:
         whole_m = np.rint(heights_m / np.float32(step_m)) * np.float32(step_m)
-        if (np.abs(heights_m - whole_m) < _OFF * step_m).mean() > MOSTLY:
+        if (np.abs(heights_m - whole_m) < _OFF * step_m).mean() > _MOSTLY:
             heights_m = whole_m
-            break
     if void.any():
         heights_m[rows[:, None].repeat(len(cols), 1)[void], cols[None].repeat(len(rows), 0)[void]] = np.nan
     return heights_m, rows, cols

@@ -215,7 +215,7 @@ def converted(
     source  begins that sentence
     whole   what the file is called
     """
-    raw = None
+    raw: Any = None
     try:
         raw = msgspec.to_builtins(given, builtin_types=_DATES, enc_hook=_plain)
         return msgspec.convert(raw, root)

@@ -23,7 +23,6 @@ import msgspec
 from swarm.config.explain import (
     choice,
     complaint,
-    converted,
     doubled,
     expected,
     explain,
@@ -100,12 +99,6 @@ def parse_scenario(
     if read.scenario is None or read.faults:
         raise ConfigError("\n".join(read.faults))
     return read.scenario
-
-
-def checked(scenario: Scenario) -> Scenario:
-    """A scenario that was made in Python, whose settings may be anything. Raises ConfigError in one sentence, which
-    names the first that no file may have."""
-    return converted(scenario, Scenario, "the scenario")
 
 
 def read_scenario(

@@ -352,11 +352,9 @@ def checked_json(data: bytes, kind: Kind, what: str, name: str) -> bytes:
             fence = msgspec.json.decode(text, type=_Plan).geoFence
             areas = [_area(each.polygon, each.inclusion) for each in fence.polygons]
             discs = [_disc(each.circle.center, each.circle.radius, each.inclusion) for each in fence.circles]
-            if not areas + discs:
-                raise TerrainError(f"{what} holds no fence")
             return _collection([*areas, *discs], name)
         if document.type == "FeatureCollection" and not document.features:
-            raise TerrainError(f"{what} holds no feature")
+            raise TerrainError(f"{what} holds no feature or fence")
         if document.crs is not None:
             document.crs.check(f"{what}: its crs")
         features = []

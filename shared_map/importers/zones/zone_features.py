@@ -98,31 +98,23 @@ def way_of(kind: Kind | None, name: str, own: Mapping[str, WayConfig]) -> Way | 
     return Way(width_m, None if given.factor == "lethal" else given.factor)
 
 
-def states_extent(column: str) -> bool:
-    """Returns True if a column states how far a point or a line reaches, in a unit that is read or not."""
-    name = column.lower()
-    return name in _EXTENTS or any(word in name for word in _UNCLEAR["anywhere"])
+def states_extent(column: str, of_point: str = "") -> bool:
+    """Returns True if a column states how far a point or a line reaches, in a unit that is read or not.
 
-
-def may_state_extent(column: str) -> bool:
-    """Returns True if a column, in whatever words, states how far a point reaches."""
-    words = re.split(r"[\W\d_]+|(?<=[a-z])(?=[A-Z])", column)
-    return states_extent(column) or any(word.lower() in _UNCLEAR["of_points"] for word in words)
+    of_point  what the column holds for a point, of which any number in it may be the reach
+    """
+    name, is_number = column.lower(), of_point.strip(" 0.,+-")[:1].isdigit()
+    words = re.split(r"[\W\d_]+|(?<=[a-z])(?=[A-Z])", column) if is_number else ()
+    may = any(word.lower() in _UNCLEAR["of_points"] for word in words)
+    return may or name in _EXTENTS or any(word in name for word in _UNCLEAR["anywhere"])
 
 
 def width_of(tags: Mapping[str, str], *, is_point: bool = False) -> float | None:
     """The width in metres that a feature has of its own; of "2-4 m" the larger.
 
-    Raises ValueError, which names the column, if it states an extent that cannot be read; of a point, also a number
-    in any column that may be one.
+    Raises ValueError, which names the column, if it states an extent that cannot be read.
     """
-    stated = {key.lower(): value for key, value in tags.items() if states_extent(key)}
-    if is_point:
-        stated |= {
-            key.lower(): value
-            for key, value in tags.items()
-            if may_state_extent(key) and value.strip(" 0.,+-")[:1].isdigit()
-        }
+    stated = {key.lower(): value for key, value in tags.items() if states_extent(key, value * is_point)}
     for key in sorted(stated, key=lambda key: [*_EXTENTS, key].index(key)):
         lengths = [_LENGTH.fullmatch(part) for part in re.split("[;-]", stated[key])]
         found = [float(each[1].replace(",", ".")) * _UNITS_M.get(each[2], 1.0) for each in lengths if each]
@@ -222,13 +214,8 @@ class _Worth:
         has_classes = name is not None or not {*assumed, *PACKED}.isdisjoint(layer.columns)
         self._by_class = bool(zone.classes) or (self._kind is not None and has_classes)
         key = "factor" if zone.kind == "factor" else "pace_s_per_m"
-        self.columns = [
-            *TAGS,
-            *PACKED,
-            *assumed,
-            *filter(may_state_extent, layer.columns),
-            *([name] if name else ()),
-        ]
+        extents = [column for column in layer.columns if states_extent(column, "1")]
+        self.columns = [*TAGS, *PACKED, *assumed, *extents, *([name] if name else ())]
         for is_wrong, why in (
             (name is not None and {name, *PACKED}.isdisjoint(layer.columns), f"has no column {name!r}"),
             (zone.classes and zone.kind == "pace", "has classes with factors, which kind pace does not take"),
@@ -259,9 +246,7 @@ class _Worth:
             is_area, key = shape.geom_type == "Polygon", (n, shape.geom_type)
             if key not in ways:
                 tags = unpacked(features.tags(n))
-                if is_area:  # it has its own extent
-                    tags = {name: value for name, value in tags.items() if not states_extent(name)}
-                way = self._way(tags, features.id(n), is_point=shape.geom_type == "Point")
+                way = self._way(tags, features.id(n), shape.geom_type)
                 over = tags.get("bridge", "no").lower() not in _NOT_A_BRIDGE
                 bridge = way is not None and self._kind == "road" and over
                 self._facts.bridges += bridge
@@ -281,7 +266,7 @@ class _Worth:
                 drawing.bridges.append(drawn)
         self._facts.used += len(used)
 
-    def _way(self, tags: dict[str, str], id: str, *, is_point: bool) -> Way | None:
+    def _way(self, tags: dict[str, str], id: str, geometry: str) -> Way | None:
         """Width and factor of a feature; None if it is left out, which the facts then tell."""
         zone, kind = self._zone, self._kind
         name = class_of(kind, tags, zone.attribute) if self._by_class else ""
@@ -303,7 +288,9 @@ class _Worth:
             return None
         closes = self._closes or (kind == "water" and not name)
         try:
-            own_m = width_of(tags, is_point=is_point and zone.width_m is None)
+            # An area has its own extent.
+            is_point = geometry == "Point" and zone.width_m is None
+            own_m = None if geometry == "Polygon" else width_of(tags, is_point=is_point)
         except ValueError as error:
             if closes or kind == "water":
                 raise unusable(self._layer.what, id, str(error)) from None

@@ -383,7 +383,7 @@ def test_another_number_of_a_line_or_of_a_point_with_a_width_is_no_extent(tmp_pa
     [
         ("a.csv", 'id,WKT\n1,"POLYGON ((9 47, 9.1 47, 9 47.1, 9 47))"\n', r"shapes as text \(WKT\)"),
         ("a.kml", '<!DOCTYPE kml [<!ENTITY a "b">]><kml><Document/></kml>', "an XML with entities of its own"),
-        ("a.plan", plan([]), "holds no fence"),
+        ("a.plan", plan([]), "holds no feature or fence"),
         ("a.asc", "ncols 1\nnrows 1\nxllcorner 0\nyllcorner 0\ncellsize 1\n1\n", "is read as a raster, which goes"),
     ],
 )
