@@ -125,7 +125,7 @@ class GridSpec:
         if self.rows * self.cols > MAX_CELLS:
             raise ValueError(f"{self.rows} x {self.cols} cells are more than {MAX_CELLS}")
         if not 0 < real("resolution_m", self.resolution_m) < math.inf:
-            raise ValueError(f"resolution_m must be positive, not {self.resolution_m}")
+            raise ValueError(f"resolution_m must be a positive number, not {self.resolution_m}")
 
     @property
     def shape(self) -> tuple[int, int]:

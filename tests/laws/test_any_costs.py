@@ -3,6 +3,7 @@
 Where uphill differs from downhill, trees are exact to the last bit as well, and grow in about the same time."""
 
 import logging
+import math
 import statistics
 import time
 import warnings
@@ -180,10 +181,10 @@ def test_shared_cell_costs_that_no_map_has_are_refused(bad: float) -> None:
 
 
 @pytest.mark.parametrize(
-    ("metres", "weight"), [(float("inf"), 0.0), (1e200, 0.0), (1.0, -1.0), (1.0, float("nan"))]
+    ("metres", "weight"), [(math.inf, 0.0), (1e200, 0.0), (1.0, -1.0), (1.0, math.nan)]
 )
 def test_lengths_that_no_map_has_are_refused(metres: float, weight: float) -> None:
-    with pytest.raises(ValueError, match="length_weight"):
+    with pytest.raises(ValueError, match="length_weight|resolution_m"):
         CostGrid(GridSpec(2, 2, metres), PlannerConfig(length_weight=weight))
 
 
