@@ -30,7 +30,6 @@ from swarm.wire.versions import read_schemas, written_schema
 
 PATH = Path(__file__).parents[1] / "reference" / "wire.md"
 JSON_PATH = PATH.with_name("wire-json.md")
-_EVERY = MEMBERS.replace(" ", ", ")
 REQUIRED = "required"
 """In place of the default of a field without one."""
 
@@ -64,7 +63,7 @@ def _granted(grants: tuple[Grant, ...]) -> str:
     """The roles of a cell without operators, of which the page says once what they may do."""
     groups = itertools.groupby((of for of in grants if of.role != OPERATOR), key=lambda of: of.own)
     named = (", ".join(of.role for of in some) + f" ({', '.join(own)})" * bool(own) for own, some in groups)
-    return "; ".join(named).replace(_EVERY, "every member")
+    return "; ".join(named).replace(MEMBERS.replace(" ", ", "), "every member")
 
 
 def _how(topic: Topic) -> str:
@@ -100,22 +99,13 @@ def _schemas(message: type[Message]) -> str:
 def _struct(struct: type[msgspec.Struct]) -> str:
     prose, _, listing = inspect.cleandoc(struct.__doc__ or "").partition("\n\n")
     listing = textwrap.indent(listing, "    ")
-    fields = [_shown(*row) for row in rows(struct)]
-    return filled("struct", about=prose, listing=listing, rows=fields, required=REQUIRED)
-
-
-def _shown(name: str, kind: str, default: str) -> tuple[str, str, str]:
-    """Returns a field as the page has it: one that is nil where it is absent has a question mark."""
-    bare = kind.removesuffix("|nil")
-    return (name, f"{bare} ?", REQUIRED) if bare != kind and default == "None" else (name, kind, default)
+    return filled("struct", about=prose, listing=listing, rows=rows(struct), required=REQUIRED)
 
 
 def rows(struct: type[msgspec.Struct]) -> list[list[str]]:
     """Returns name, type and default of each field."""
     hints = typing.get_type_hints(struct, include_extras=True)
-    return [
-        [field.name, type_text(hints[field.name]), default_text(field)] for field in msgspec.structs.fields(struct)
-    ]
+    return [[each.name, type_text(hints[each.name]), default_text(each)] for each in msgspec.structs.fields(struct)]
 
 
 def parts(struct: type[msgspec.Struct], kind: type[Any] = msgspec.Struct) -> list[Any]:
