@@ -40,6 +40,10 @@ _TICKS = 32
 _NOTICED = 0.05
 """Moves per tick, far below what makes another row the better one."""
 
+TRIED_AFTER = 2048
+"""Moves of the target after which the time of the other way to follow them is the model's again, so that it is
+tried: it may have been measured while the machine was busy. That costs a full search at most, some percent of what
+the moves between do."""
 _MEDIAN_OF = 5
 """Number of recent times whose median counts: single ones take longer, as after a change of processors, or to cut a
 tree into pieces."""
@@ -65,9 +69,10 @@ class GrowthTimes:
         self._grid = grid
         self.full_ns = self.model_ns
         self.in_pieces = grid.cells >= PIECES_CELLS and not climbs
-        self.exact_ns = grid.cells * MODEL_EXACT_NS_PER_CELL
+        self._model_exact_ns = grid.cells * MODEL_EXACT_NS_PER_CELL
         if self.in_pieces:
-            self.exact_ns = math.isqrt(grid.cells) * MODEL_PIECES_NS_PER_ROW
+            self._model_exact_ns = math.isqrt(grid.cells) * MODEL_PIECES_NS_PER_ROW
+        self.exact_ns = self._model_exact_ns
         self.row = StrategyRow(OnMove.WHOLE_TREE)
         self.narrowest = 4 << config.k_min
         """Half width of the narrowest scheduled window, in cells."""
@@ -84,13 +89,13 @@ class GrowthTimes:
         """True if a row may come into force by which growths stop: askers are then noted under the others, too."""
         self._full_took_ns: deque[int] = deque(maxlen=_MEDIAN_OF)
         self._exact_took_ns: deque[int] = deque(maxlen=_MEDIAN_OF)
-        # Time of a growth up to askers, scaled to the whole map. The first ones include allocation of scratch.
-        self._near_whole_ns = grid.cells * MODEL_NEAR_NS_PER_CELL
-        self._near_took_ns = deque([self._near_whole_ns] * 2, maxlen=_MEDIAN_OF)
+        self._expect_near(grid.cells * MODEL_NEAR_NS_PER_CELL)
         self._moves_per_tick, self._chosen_at = 1.0, 1.0
         """Moves in the last `_TICKS` ticks or so; the value when the row was chosen."""
         self._ticks = 0
-        self._near_cells = math.inf
+        self._near_cells, self._near_is_new = math.inf, False
+        self._kind, self._in_a_row = "", 0
+        """Kind of the last update that was observed, and the number of equal ones before it."""
         self._choose()
 
     def set_budget(self, cpu_budget: float) -> None:
@@ -112,8 +117,8 @@ class GrowthTimes:
     def note_near(self, cells: float) -> None:
         """Notes the cells of the window that holds the target and its askers, 0 without any; inf if growths cannot
         stop."""
-        if cells != self._near_cells:
-            self._near_cells = cells
+        if cells != self._near_cells or self._near_is_new:
+            self._near_cells, self._near_is_new = cells, False
             self._choose()
 
     @property
@@ -130,18 +135,35 @@ class GrowthTimes:
 
     def observe(self, kind: str, took_ns: int) -> None:
         """CPU time (ns) of a growth or an exact move, by the kind of update. A simulation does not call it."""
+        self._in_a_row = self._in_a_row + 1 if kind == self._kind else 0
+        self._kind = kind
+        if self._in_a_row == TRIED_AFTER:
+            self._in_a_row = 0
+            if kind == "exact":
+                self._expect_near(min(self._near_whole_ns, self._grid.cells * MODEL_NEAR_NS_PER_CELL))
+            else:
+                self.exact_ns = min(self.exact_ns, self._model_exact_ns)
+                self._exact_took_ns.clear()
         observers = {"exact": self.observe_exact_ns, "bounded": self._observe_near_ns}
         observers.get(kind, self.observe_full_ns)(took_ns)
+
+    def _expect_near(self, whole_ns: int) -> None:
+        """A growth up to askers is expected to take this long, scaled to the whole map, until some were measured.
+        The first ones include allocation of scratch."""
+        self._near_whole_ns = max(1, whole_ns)
+        self._near_took_ns = deque([self._near_whole_ns] * 2, maxlen=_MEDIAN_OF)
 
     def _observe_near_ns(self, took_ns: int) -> None:
         if self._near_cells:  # one without askers tells nothing of others
             whole_ns = int(took_ns * self._grid.cells / (self._near_cells + NEAR_CELLS))
             self._near_whole_ns = max(1, _median_with(self._near_took_ns, whole_ns))
-            self._choose()
+            self._near_is_new = True
 
     def observe_full_ns(self, took_ns: int) -> None:
         """Notes the time of a full search, unless it found networks, too."""
         median_ns = _median_with(self._full_took_ns, took_ns)
+        if not self.row.is_exact:
+            self._expect_near(self._near_whole_ns * median_ns // self.full_ns)
         # Growths foretell no move of a tree in pieces: they include the cutting, and all planners of a machine grow
         # their first trees at once. The tree is there, so a move is tried. To leave it untried takes another
         # growth, and twice the memory. Beside windows, no exact move is measured, and growths tell that a load of
@@ -228,7 +250,7 @@ class Askers:
     def turn(self) -> None:
         """Notes that the tree is updated now."""
         if self._fresh:
-            self.cells = np.unique(np.concatenate(self._fresh))
+            self.cells = self._fresh[0] if len(self._fresh) == 1 else np.unique(np.concatenate(self._fresh))
             self._fresh = []
         self._needed.append(0)
 

@@ -13,9 +13,11 @@ asked.
 from __future__ import annotations
 
 import logging
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import partial
+from itertools import chain
 from typing import NamedTuple
 
 import msgspec
@@ -40,16 +42,19 @@ from swarm.wire.messages.orders import Obey
 from swarm.wire.messages.planning import PlaceRouteReply, PlaceRouteRequest, PlaceStatus, PushedRoute
 from swarm.wire.messages.vehicles import Chasers
 from swarm.wire.route_columns import Route, RouteBatch, RouteStatus
-from swarm.wire.topics import PLACE_ROUTE, SENT, asker_of, is_own
+from swarm.wire.topics import PLACE_ROUTE, SENT, asker_of, rank_of
 
 log = logging.getLogger(__name__)
 
 SLICE_CELLS = 1 << 16
 """Cells that are grown before others have their turn: 1 to 4 ms."""
-_MOST_WAITING, _MOST_EACH = 1 << 17, 1 << 15
-"""Prices of the questions that wait, of all askers and of one. Of more the oldest are refused."""
+_MOST_WAITING, _MOST_EACH = 1 << 16, 1 << 14
+"""Prices of the questions that wait for near goals, and for far ones, of all askers and of one. Of more the oldest
+are refused."""
 _BASE_PRICE, _CELLS_OF_A_PRICE = 16, 1 << 10
 """Price of a question without its routes, which bounds how many wait; and cells grown at the price of a route."""
+_MOST_NEAR = 3
+"""Slices of near goals, one after the other, while far ones of the same rank wait."""
 _HOLD_NS = NS_PER_S
 """A question waits at most this time for its growth; then it is answered as far as it is known."""
 _KEEPS_UP_NS = NS_PER_S
@@ -71,8 +76,8 @@ class _Question:
     asked_ns: int
     found: list[Route] = field(default_factory=list)
     lethal_goal: bool = False
-    turn: int = 0
-    """Those of a lower one come first: of agents before those of others, and of one slice before longer ones."""
+    rank: int = 0
+    """Those of a lower one come first: of agents before those of others."""
     version: int = -1
     """Version of the map on which they were found."""
 
@@ -203,11 +208,14 @@ class PlacesService(PlanningProcess):
         """The agents which may not know what this process knows, and their groups. Routers hold an asker's name
         against its certificate."""
         self._classes: dict[str, _ClassTrees] = {}
-        self._waiting: FairQueue[_Question] = FairQueue(_MOST_WAITING, _MOST_EACH)
+        self._near: FairQueue[_Question] = FairQueue(_MOST_WAITING, _MOST_EACH)
+        """Questions for which one slice is expected to do."""
+        self._far: FairQueue[_Question] = FairQueue(_MOST_WAITING, _MOST_EACH)
+        self._near_in_a_row = 0
         self._at_work: _Question | None = None
         """The question of which the worker has a slice."""
         self._going_on: list[_Question] = []
-        """Questions that wait for another slice. The last one has the lowest turn."""
+        """Questions that wait for another slice. The last one has the lowest rank."""
         for name in ("routes_served", "place_cells_grown", "place_questions_refused", "pushes"):
             self.counters.count(name, 0)
 
@@ -231,7 +239,7 @@ class PlacesService(PlanningProcess):
         self._take_map(now_ns)
         self._lead(self._candidacy.tick(not self.lacks(), now_ns), now_ns)
         self._push_due(now_ns)
-        self.counters.gauge("places_waiting", float(len(self._waiting)))
+        self.counters.gauge("places_waiting", float(len(self._near) + len(self._far)))
         self.counters.gauge("place_trees", float(sum(each.trees.trees for each in self._classes.values())))
         self.counters.gauge("place_bytes", float(sum(each.trees.bytes for each in self._classes.values())))
         self._order_client.tick(now_ns)
@@ -240,8 +248,8 @@ class PlacesService(PlanningProcess):
 
     def stop(self, now_ns: int) -> None:
         self._candidacy.stop()
-        waiting = iter(self._waiting.take, None)
-        for question in (self._at_work, *self._going_on, *waiting):
+        waiting = iter(self._near.take, None), iter(self._far.take, None)
+        for question in (self._at_work, *self._going_on, *chain(*waiting)):
             if question is not None:
                 self._drop(question, "the process ends")
         self._at_work = None
@@ -274,16 +282,20 @@ class PlacesService(PlanningProcess):
         away = (max(abs(cell // cols - row), abs(cell % cols - col)) for cell in request.cells)
         cells = 3 * max(away, default=0) ** 2
         price = _BASE_PRICE + len(request.cells) + min(cells, SLICE_CELLS) // _CELLS_OF_A_PRICE
-        question.turn = 2 * (not is_own(question.asker)) + (cells > SLICE_CELLS)
-        flow = f"{question.asker} {question.turn}"
-        for dropped in self._waiting.put(flow, question, price=price, rank=question.turn):
+        question.rank = rank_of(question.asker)
+        queue = self._far if cells > SLICE_CELLS else self._near
+        for dropped in queue.put(question.asker, question, price=price, rank=question.rank):
             self._drop(dropped, "too many questions wait here already: ask again in a second")
 
     def _next(self) -> _Question | None:
-        """The question that has the next slice."""
-        if self._going_on and not self._waiting.comes_before(self._going_on[-1].turn):
-            return self._going_on.pop()
-        return self._waiting.take()
+        """The question that has the next slice. Of those of one rank, near goals come first, but not for ever."""
+        goes_on = self._going_on[-1].rank if self._going_on else math.inf
+        far, near = min(goes_on, self._far.first_rank), self._near.first_rank
+        if far < near or (far == near and self._near_in_a_row >= _MOST_NEAR):
+            self._near_in_a_row = 0
+            return self._going_on.pop() if goes_on == far and self._going_on else self._far.take()
+        self._near_in_a_row += 1
+        return self._near.take()
 
     def _go_on(self) -> None:
         """Gives the worker the next slice, if it has none."""
@@ -335,7 +347,6 @@ class PlacesService(PlanningProcess):
         for vehicle in done.outdone:
             trees.followers.mark_stale(vehicle)
         if not question.done and (question.event is None or now_ns - question.asked_ns < _HOLD_NS):
-            question.turn |= 1
             self._going_on.append(question)
         elif question.event is None:
             self._push_routes(trees, question, now_ns)
@@ -393,7 +404,7 @@ class PlacesService(PlanningProcess):
             trees.followers.drop_silent(now_ns)
             if not self._leads or not self._has_kernels(name):
                 continue
-            if len(trees.followers) and trees.cost_map.dirty and not self._waiting:
+            if len(trees.followers) and trees.cost_map.dirty and not (self._near or self._far):
                 self._wait(_Question(None, self._job, PlaceRouteRequest(to=0, vehicle_class=name), now_ns))
             for (goal, max_cells), batch in trees.followers.due(now_ns).items():
                 for id, follower in batch:

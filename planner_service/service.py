@@ -308,7 +308,7 @@ class PlannerService(PlanningProcess):
         """
         held, self._held = self._held, []
         spent = 0
-        for n, (asked_ns, event) in enumerate(sorted(held, key=lambda each: not topics.is_own(each[1].asker))):
+        for n, (asked_ns, event) in enumerate(sorted(held, key=lambda each: topics.rank_of(each[1].asker))):
             request = event.request
             assert isinstance(request, RouteRequest | CostRequest)
             name = request.vehicle_class
@@ -323,7 +323,7 @@ class PlannerService(PlanningProcess):
                 self._held.append((asked_ns, event))
                 continue
             spent += (len(request.cells) + 1) * (_ROUTE_COST if isinstance(request, RouteRequest) else 1)
-            if isinstance(request, RouteRequest) and request.force and not topics.is_own(event.asker):
+            if isinstance(request, RouteRequest) and request.force and topics.rank_of(event.asker):
                 request, self._forced = msgspec.structs.replace(request, force=not self._forced), True
             planner.answer(request, now_ns, partial(self._send, event))
 

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from planner_service.growth_times import Askers, GrowthTimes, WindowSchedule, exact_half
 from planner_service.kernels.layout import NONE
-from planner_service.kernels.route_kernels import UNREACHABLE, box_of
+from planner_service.kernels.route_kernels import UNREACHABLE, open_cells
 from planner_service.kernels.stride_networks import StrideNetwork
 from planner_service.strategy import OnMove, Strategy, StrategyRow, whole_trees_only
 from planner_service.tree import partitioned_tree
@@ -164,6 +164,7 @@ class TargetTree:
         self._bounds = LowerBounds(self.cost_grid)
         # Growths that stop, and the askers, which decide how far they go. Some were too far for a growth here.
         self._growth = PartialGrowth(self.cost_grid)
+        self._can_stop = False
         self._askers = Askers()
         self._too_far = False
         # The tree became exact on this thread: before it is no longer, its costs are to be taken for bounds.
@@ -184,7 +185,7 @@ class TargetTree:
         """Begins with the cell costs of the map before any mark, which other processes share; `update` receives all
         changes since. Before the first `update`."""
         self.cost_grid.share(cell_cost)
-        self._loaded = True
+        self._loaded, self._can_stop = True, self._growth.usable
 
     # --- keeping up ---------------------------------------------------------------------------------------------
 
@@ -201,7 +202,6 @@ class TargetTree:
         changes = self._learn(pace, dirty)
         self.map_version = map_version
         self._askers.turn()
-        self.times.note_near(self._askers.needed if self._growth.usable else np.inf)
         return self._follow(target_cell, changes) if self._set_target(target_cell, changes) else Update("none")
 
     def full_job(self, target_cell: int) -> Callable[[], partitioned_tree.GrownTree]:
@@ -299,8 +299,7 @@ class TargetTree:
             return RouteBatch.none(asked, NO_TARGET)
         self._reach(asked)
         routes = read_routes(self._tree, self._bounds, asked, max_cells)
-        if not self._is_whole:
-            unknown = routes.statuses == UNREACHABLE
+        if not self._is_whole and (unknown := routes.statuses == UNREACHABLE).any():
             routes.statuses[unknown] = NO_TARGET
             routes.lower_bound_s[unknown] = self._tree.bound * self.cost_grid.time_share
         return routes
@@ -327,10 +326,13 @@ class TargetTree:
         """Takes the map's changes. None the first time: everything is new."""
         if not self._loaded:
             self.cost_grid.load(pace)
-            self._loaded = True
+            self._loaded, self._can_stop = True, self._growth.usable
             return None
         changes = self.cost_grid.apply(pace, dirty)
+        if not changes.cells.size:
+            return changes
         self._growth.learn(changes)
+        self._can_stop = self._growth.usable
         if changes.any_lower:
             self._tree.window_bound = None
         self._learn_bounds(changes)
@@ -381,6 +383,7 @@ class TargetTree:
 
     def _follow(self, target_cell: int, changes: Changes | None) -> Update:
         """Brings the tree up to date with the map, then with its target: decide, and do it."""
+        self.times.note_near(self._askers.needed if self._can_stop else np.inf)
         if self._state is State.STALE:
             return self._grow_full(target_cell)
         self._windows.moves += target_cell != self._tree.root
@@ -466,8 +469,9 @@ class TargetTree:
     def _grow_full(self, target_cell: int) -> Update:
         """Grows the whole tree: here or, where that would take too long, on the worker. The old tree is dropped. If
         growths can stop, and more is not needed here, it grows only up to the askers."""
-        if self._growth.usable and (self._stops or not self._is_quick):
-            near = self._grow_near(target_cell, rest=not self._stops)
+        stops = self._stops
+        if self._can_stop and (stops or not self._is_quick):
+            near = self._grow_near(target_cell, rest=not stops)
             if near is not None:
                 return near
         if not self._is_quick:
@@ -492,7 +496,7 @@ class TargetTree:
         """Returns True if a growth is to go only as far as the askers: with every move of brute force,
         and instead of exact moves that take longer."""
         row = self.strategy
-        if not (row.stops_at_askers and self._growth.usable):
+        if not (row.stops_at_askers and self._can_stop):
             return False
         if row.on_move is OnMove.WHOLE_TREE:
             return self._is_quick or self.times.is_short(self.times.near_ns)
@@ -510,7 +514,7 @@ class TargetTree:
             return None
         if not moved and changes is not None and not changes.cells.size:
             return Update("none")
-        if not self._stops and whole:
+        if whole and not self._stops:
             return None
         return self._grow_full(target_cell)
 
@@ -520,7 +524,7 @@ class TargetTree:
         rest  the worker is to grow the whole tree
         """
         root, askers = self.cost_grid.pad(target_cell), self._passable(self._askers.cells)
-        aim = self._growth.aim_at(askers, root)
+        aim = self._growth.aim_at(askers, root, self._tree.parent)
         self._growth.begin(root)
         grown = self._growth.go_on(askers, self.times.most_cells, aim)
         if grown < 0:
@@ -541,15 +545,15 @@ class TargetTree:
         """Returns True if these cells are answered for good; if not, a worker's tree is to come."""
         if not self.ready or self._is_whole:
             return self.ready
-        self._reach(cells)
+        self._reach(np.asarray(cells, np.int64).reshape(-1))
         return self._is_whole or not self._without_path(self._open(cells)).size
 
-    def _reach(self, asked: Any) -> None:
+    def _reach(self, asked: NDArray[np.int64]) -> None:
         """Continues a stopped growth up to these cells."""
         if not self.times.may_stop and self._is_whole:
             return
-        starts = self._open(asked)
-        if not self._is_whole and self._without_path(starts).size:
+        starts, unknown, half = self._look(asked)
+        if not self._is_whole and unknown:
             if self._growth.go_on(starts, self.times.most_cells) < 0:
                 self._too_far = True
                 return
@@ -557,21 +561,19 @@ class TargetTree:
             self._too_far |= not self._is_whole and self._without_path(starts).size > 0
         if not self._is_whole and isinstance(self._tree, CostToGoTree):
             self._tree.point(starts)
-        self._note(starts)
+        self._note(starts, half)
 
     def expect(self, cells: Any) -> None:
         """Notes cells from which queries will come, such as those of a standby's followers: growths will reach
         them."""
-        if self.ready and self._growth.usable:
-            self._note(self._open(cells))
+        if self.ready and self._can_stop:
+            starts, _, half = self._look(self._inside(cells))
+            self._note(starts, half)
 
-    def _note(self, starts: NDArray[np.int64]) -> None:
+    def _note(self, starts: NDArray[np.int64], half: int) -> None:
         """Notes padded cells that asked, and how far a growth must go for them."""
         if not starts.size:
             return
-        row, col = divmod(self.cost_grid.pad(self._tree.root), self.cost_grid.stride)
-        row0, col0, row1, col1 = box_of(starts.astype(np.uint32), self.cost_grid.stride)
-        half = max(row - row0, row1 - 1 - row, col - col0, col1 - 1 - col)
         if (self._is_whole or self._too_far) and self._without_path(starts).size:
             half = self._grid.cells
         self._askers.note(starts, self._grid.around(self._tree.root, half).cells)
@@ -591,7 +593,15 @@ class TargetTree:
 
     def _open(self, cells: Any) -> NDArray[np.int64]:
         """Those of some numbers that are passable cells of the grid, padded."""
-        return self._passable(self.cost_grid.pad_all(self._inside(cells)))
+        return self._look(np.asarray(cells, np.int64).reshape(-1))[0]
+
+    def _look(self, asked: NDArray[np.int64]) -> tuple[NDArray[np.int64], int, int]:
+        """Returns those of some numbers that are passable cells of the grid, padded; how many of them a growth that
+        has stopped did not reach; and how many rows or columns the farthest is away from the root."""
+        grid, starts = self.cost_grid, np.empty(asked.size, np.int64)
+        found = grid.cell_cost, self._growth.cost, grid.stride, grid.pad(self._tree.root), asked, starts
+        count, unknown, half = open_cells(*found)
+        return starts[:count], unknown, half
 
     def _passable(self, starts: NDArray[np.int64]) -> NDArray[np.int64]:
         return starts[self.cost_grid.cell_cost[starts] < np.inf]
@@ -599,7 +609,7 @@ class TargetTree:
     def _force_near(self, wanted: NDArray[np.int64]) -> Update | None:
         """Makes the tree exact as far as these cells are; None if that takes too long here."""
         tree, growth = self._tree, self._growth
-        if not (isinstance(tree, CostToGoTree) and growth.usable and tree.precise and self._all_kernels()):
+        if not (isinstance(tree, CostToGoTree) and self._can_stop and tree.precise and self._all_kernels()):
             return None
         growth.begin(self.cost_grid.pad(tree.root))
         starts = self._open(wanted)

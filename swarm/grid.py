@@ -108,7 +108,8 @@ class GridSpec:
     west_m, north_m  outer corner of cell (0, 0) in the frame of `crs`
     crs              coordinate system, such as "EPSG:32632"; "local" is metres from anywhere
 
-    Raises ValueError on a shape or resolution that no grid has.
+    Raises ValueError on a shape or resolution that no grid has, TypeError on what is no number. A cell is whole
+    numbers: half a row would be half the map's width away.
     """
 
     rows: int
@@ -119,11 +120,11 @@ class GridSpec:
     crs: str = "local"
 
     def __post_init__(self) -> None:
-        if self.rows < 1 or self.cols < 1:
+        if whole(self.rows) < 1 or whole(self.cols) < 1:
             raise ValueError(f"a grid needs at least one cell, not {self.rows} x {self.cols}")
         if self.rows * self.cols > MAX_CELLS:
             raise ValueError(f"{self.rows} x {self.cols} cells are more than {MAX_CELLS}")
-        if not self.resolution_m > 0:
+        if not 0 < real("resolution_m", self.resolution_m) < math.inf:
             raise ValueError(f"resolution_m must be positive, not {self.resolution_m}")
 
     @property
@@ -165,14 +166,15 @@ class GridSpec:
         return 0 <= row < self.rows and 0 <= col < self.cols
 
     def cell(self, row: int, col: int) -> int:
-        """Flat index of (row, col). Raises OutsideGridError outside the grid."""
+        """Flat index of (row, col). Raises OutsideGridError outside the grid, TypeError between cells."""
+        row, col = whole(row), whole(col)
         if not self.inside(row, col):
             raise OutsideGridError(f"row {row}, col {col} is not in {self.rows} x {self.cols}")
         return row * self.cols + col
 
     def row_col(self, cell: int) -> tuple[int, int]:
-        """(row, col) of a flat index. Raises OutsideGridError outside the grid."""
-        if not 0 <= cell < self.cells:
+        """(row, col) of a flat index. Raises OutsideGridError outside the grid, TypeError between cells."""
+        if not 0 <= whole(cell) < self.cells:
             raise OutsideGridError(f"cell {cell} is not in {self.rows} x {self.cols}")
         return divmod(cell, self.cols)
 

@@ -186,7 +186,8 @@ class AgentService(MemberService):
         acts = self._acted_ns and now_ns - self._acted_ns >= self._parts.act_ns and self.agent.many_wait
         if acts and not self.agent.holdings.replaced:
             self._acted_ns = now_ns
-            self.agent.obstacles_moved()
+            self.agent.obstacles.tick(now_ns)
+            self._take_obstacles(now_ns)  # a process that was stopped acts before its next tick
             self._drive(now_ns)
             self._perform(self.agent.decide(now_ns))
             self._report(Places(self._replica.grid, self.agent.vehicles.values()), now_ns)

@@ -264,6 +264,8 @@ _POINTS = 120
 _TRACK_NS = int(TRACK_S * NS_PER_S)
 _MOST_PLACES = 400_000
 """Sampled places that are kept at most, of vehicles and of targets each."""
+_OF_SAMPLING = 40
+"""A sampling itself takes as much memory as 40 places: few targets would fill it for half a day."""
 _NOTES_KEPT = 1000
 """The newest ones. Chosen, not measured."""
 _ROUTE_BYTES = 4_000_000
@@ -302,8 +304,8 @@ class Recorder:
         self.routes = Thinned[BegunRoute](_ROUTE_BYTES, lambda begun: len(begun.route.directions) + _OF_ROUTE_BYTES)
         self.driven = Driven()
         self.notes: deque[tuple[float, Note]] = deque(maxlen=_NOTES_KEPT)
-        self.vehicle_tracks = Thinned[Sampling](_MOST_PLACES, lambda sampling: len(sampling.keys))
-        self.target_tracks = Thinned[Sampling](_MOST_PLACES, lambda sampling: len(sampling.keys))
+        self.vehicle_tracks = Thinned[Sampling](_MOST_PLACES, lambda of: len(of.keys) + _OF_SAMPLING)
+        self.target_tracks = Thinned[Sampling](_MOST_PLACES, lambda of: len(of.keys) + _OF_SAMPLING)
         self.routed: set[str] = set()
         self._gap_max: float | None = None
 

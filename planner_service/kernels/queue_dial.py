@@ -12,13 +12,14 @@ Arrays, beside those of `layout`:
     touched  uint32  (size + 1,)     padded cells that have a cost, in the order of the buckets they got it from
     batch    uint32  (size + AHEAD,) padded cells of the bucket that is being served
     queue    as of `heap_and_buckets`; `make_scratch` says how large
-    aim      a tuple of float32      padded rows and columns (row0, col0, row1, col1) of a box with all askers, row1
-                                     and col1 in it; the lowest cell cost, s; and the most that a cheapest way of
-                                     an asker costs, s. A growth leaves out the cells over which every way costs
-                                     more, even at the lowest cost. With `NO_AIM` it leaves out none
-    state    int64   (4,)            the last bucket served; entries that wait in the queue; how many of `touched`
-                                     were put into it; how many there are. (0, 0, 0, 1) where a growth begins,
-                                     with a cost of 0 for the root, the first of `touched`
+    aim      (lowest, most, boxes)   the lowest cell cost, s; what a cheapest way of an asker costs at most, s; and
+                                     float32 (n, 5), the boxes of `route_kernels.find_aim`. A growth leaves
+                                     out the cells over which every way of an asker without a cost costs more, even
+                                     at the lowest cost. With `NO_AIM` it leaves out none
+    state    int64   (5,)            the last bucket served; entries that wait in the queue; how many of `touched`
+                                     were put into it; how many there are; 1 if cells were left out, else 0.
+                                     (0, 0, 0, 1, 0) where a growth begins, with a cost of 0 for the root, the
+                                     first of `touched`
 
 The form of the loops was measured, and small changes cost much. Cells are touched without branches, sorted into
 buckets in two passes (which bucket, then where in it: in one, each store had the next cell's loads wait), and taken
@@ -47,10 +48,11 @@ WHOLE = -1
 AHEAD = 8
 """Cells of a batch between asking for one's memory and using it: a fifth of the time at 2048 x 2048
 (docs/design/bucket-queues.md)."""
-Aim = tuple[float, float, float, float, float, float]
-NO_AIM: Aim = (0.0, 0.0, 0.0, 0.0, 0.0, np.inf)
+Aim = tuple[float, float, NDArray[np.float32]]
+NO_AIM: Aim = (0.0, np.inf, np.empty((1, 5), np.float32))
 _DETOUR = np.float32(0.4142135)
 """Least that a diagonal octile step costs beyond a straight one, in straight ones."""
+_AIM = "Tuple((f4, f4, f4[:, ::1]))"
 _SCRATCH = f"Tuple((u4[::1], u4[::1], {QUEUE}))"
 
 
@@ -189,11 +191,12 @@ def _file(grid, cost, buckets, scratch, first, count, least):
 
 
 @helper
-def _leave_out(grid, cost, cells, count, aim):
+def _leave_out(grid, cost, cells, count, aim, asker):
     """Takes the cells that `aim` leaves out from `cells`, and their costs. Returns how many are left. Divides as
     `box_of`."""
     stride, rule = grid[2], grid[3]
-    row0, col0, row1, col1, lowest, most = aim
+    lowest, most, boxes = aim
+    row0, col0, row1, col1 = boxes[asker, 0], boxes[asker, 1], boxes[asker, 2], boxes[asker, 3]
     share = 1.0 / stride
     slanted = _DETOUR if rule == layout.RULE_OCTILE else _ZERO32
     left = _ZERO
@@ -212,14 +215,15 @@ def _leave_out(grid, cost, cells, count, aim):
     return left
 
 
-@kernel(f"({layout.GRID}, f4[::1], {layout.BUCKETS}, {_SCRATCH}, i8[::1], i8[::1], i8, UniTuple(f4, 6))")
+@kernel(f"({layout.GRID}, f4[::1], {layout.BUCKETS}, {_SCRATCH}, i8[::1], i8[::1], i8, {_AIM})")
 def grow_by_buckets(grid, cost, buckets, scratch, state, askers, most, aim):
     """Costs to a root. Goes on from `state`, which `resume` or an earlier call left, or begins.
 
     buckets  width: below the lowest cell cost, s, so that nothing in a bucket leads back into it. count: of the
              circular queue, a power of two; count * width exceeds the costliest step by two widths
     scratch  as `make_scratch` returns it
-    askers   padded cells, passable ones: it stops behind the bucket from which the last of them got its cost
+    askers   padded cells, passable ones: it stops behind the bucket from which the last of them got its cost.
+             Where it aims, those come first which are expected to cost less
     most     it stops as well once this many more cells have a cost. WHOLE: it stops for nothing, and begins with
              the root askers[0]. All of `cost` is written, inf on lethal cells
     Returns the last bucket, or TOO_FINE. No cost exceeds (last + 1) * width. While cells wait, by `state`, a cell
@@ -230,7 +234,7 @@ def grow_by_buckets(grid, cost, buckets, scratch, state, askers, most, aim):
     """
     cell_cost, _, stride, rule, corners = grid
     touched, batch, queue = scratch
-    _, circle = buckets
+    width, circle = buckets
     head, tail = queue[3], queue[4]
     s = np.uint64(stride)
     length = np.uint64(circle)
@@ -241,7 +245,7 @@ def grow_by_buckets(grid, cost, buckets, scratch, state, askers, most, aim):
         open_costs(cell_cost, cost)
         cost[np.uint64(askers[0])] = _ZERO32
         touched[0] = askers[0]
-        state[0], state[1], state[2], state[3] = 0, 0, 0, 1
+        state[0], state[1], state[2], state[3], state[4] = 0, 0, 0, 1, 0
     if state[2] == 0:
         empty(queue, 2 * circle if rule == layout.RULE_OCTILE else circle)
     current = np.int32(state[0])
@@ -251,8 +255,9 @@ def grow_by_buckets(grid, cost, buckets, scratch, state, askers, most, aim):
     while True:
         # Cells touched from the last bucket join the queue: their cost is final.
         following = np.int32(current + 1)
-        if aim[5] < layout.INF:
-            total = filed + _leave_out(grid, cost, touched[filed:], total - filed, aim)
+        if aim[1] < layout.INF and np.float32(current) * np.float32(width) >= aim[2][asker, 4]:
+            total = filed + _leave_out(grid, cost, touched[filed:], total - filed, aim, asker)
+            state[4] = 1
         waiting += _file(grid, cost, buckets, scratch, filed, total - filed, following)
         filed = total
         if most != WHOLE:
@@ -283,6 +288,19 @@ def grow_by_buckets(grid, cost, buckets, scratch, state, askers, most, aim):
     if most == WHOLE:
         close_costs(cost)
     return current if current <= 1 << 20 or waiting == _ZERO else layout.TOO_FINE
+
+
+@kernel("void(f4[::1], u4[::1], i8[::1], i8)")
+def begin(cost, touched, state, root):
+    """Begins the growth of a padded root, or none if that is -1. The cells which the last growth touched cost inf
+    again; those that are lethal by now keep WALL."""
+    for i in range(state[3]):
+        v = np.uint64(touched[i])
+        c = cost[v]
+        cost[v] = layout.INF if c >= _ZERO32 else c
+    state[:] = 0
+    if root >= 0:
+        cost[root], touched[0], state[3] = _ZERO32, root, 1
 
 
 @kernel(f"({layout.GRID}, f4[::1], {layout.BUCKETS}, {_SCRATCH}, i8[::1], {layout.BOX}, f4[:, ::1], i8)")
@@ -320,4 +338,4 @@ def resume(grid, cost, buckets, scratch, state, box, crop, first):
             if rule == layout.RULE_OCTILE and batch[0] >= first:
                 put(queue, one, _ONE, batch, mask, length)
                 waiting += _ONE
-    state[0], state[1], state[2], state[3] = first - 1, waiting, total, total
+    state[0], state[1], state[2], state[3], state[4] = first - 1, waiting, total, total, 0

@@ -343,6 +343,103 @@ def point_routes(grid, cost, root, starts, parent, pointed, count):
     return count
 
 
+@kernel("(f4[::1], f4[::1], i8, i8, i8[::1], i8[::1])")
+def open_cells(cell_cost, cost, stride, root, asked, cells):
+    """Writes those of some numbers which are passable cells of the grid to `cells` (n,), padded.
+
+    cost  of a growth that has stopped; it may be empty
+    Returns how many they are; how many of them have no cost; and how far the farthest is from the padded root,
+    in rows or columns.
+    """
+    cols = stride - 2
+    most = (cell_cost.size // stride - 2) * cols
+    row, col = root // stride, root % stride
+    count = unknown = away = 0
+    for i in range(asked.size):
+        down, across = asked[i] // cols + 1, asked[i] % cols + 1
+        v = down * stride + across
+        if asked[i] >= 0 and asked[i] < most and cell_cost[v] < INF:
+            cells[count] = v
+            count += 1
+            unknown += cost.size == 0 or not cost[v] < INF
+            away = max(away, abs(down - row), abs(across - col))
+    return count, unknown, away
+
+
+@helper
+def _driven_to(grid, parent, start, root):
+    """float64, s: what it costs to drive from a padded cell along the parents as far as beside the root of another
+    tree, and then there; inf if they lead past it, or over what is lethal or shut by now."""
+    cell_cost, offsets, _, rule, corners = grid
+    lengths = np.float64(1.0), np.float64(diagonal_length(rule))
+    v, driven, least = start, 0.0, np.inf
+    for _ in range(parent.size):
+        if v == root:
+            return driven
+        for k in range(8):
+            if v + offsets[k] == root and (corners or not k & 1 or not is_shut(cell_cost, offsets, v, k)):
+                least = min(least, driven + np.float64(cell_cost[root]) * lengths[k & 1])
+        way = parent[v]
+        if way == NONE or (way & 1 and not corners and is_shut(cell_cost, offsets, v, way)):
+            break
+        v += offsets[way]
+        driven += np.float64(cell_cost[v]) * lengths[way & 1]
+    return least
+
+
+_AIMED = 4.0
+"""No cells are left out while the rest of the ways may be this many times as long as that from the root straight to
+the askers: to find out which takes longer than to grow them there."""
+
+
+@helper
+def _sort(askers, boxes):
+    """Sorts cells by column 4 of their rows (D. L. Shell, Communications of the ACM 2(7), 1959, 30-32)."""
+    gap = askers.size // 2
+    while gap > 0:
+        for i in range(gap, askers.size):
+            cell, bound, j = askers[i], boxes[i, 4], i
+            while j >= gap and boxes[j - gap, 4] > bound:
+                askers[j], boxes[j, 4] = askers[j - gap], boxes[j - gap, 4]
+                j -= gap
+            askers[j], boxes[j, 4] = cell, bound
+        gap //= 2
+
+
+@kernel(f"({GRID}, f4[::1], u1[::1], i8[::1], i8, UniTuple(f8, 2), f4[:, ::1])")
+def find_aim(grid, cost, parent, askers, root, known, boxes):
+    """Finds which cells a growth to a new root may leave out, by upper bounds of what the cheapest ways cost.
+
+    cost    of an older root's tree; inf where a cell has none
+    parent  of any tree, which the map's changes since do not make wrong here; it may be empty
+    askers  padded, passable cells; sorted by their upper bounds
+    known   s; what the cheapest way from that older root to the new one costs at most (inf: `cost` tells nothing),
+            and the lowest cell cost
+    boxes   (n, 5), written: for each asker and those behind it, the padded rows and columns (row0, col0, row1,
+            col1) in which they lie, row1 and col1 among them; and the cost, s, from which on it pays to leave out
+            cells
+    Returns what none of the ways exceeds, s: inf if nothing is known.
+    """
+    stride = grid[2]
+    between, lowest = known
+    for i in range(askers.size):
+        boxes[i, 4] = min(np.float64(cost[askers[i]]) + between, _driven_to(grid, parent, askers[i], root))
+    _sort(askers, boxes)
+    most = np.float64(boxes[askers.size - 1, 4])
+    most *= 1.0 + (most / lowest + 8.0) * 2.0**-22  # costs are rounded once for each step
+    home_row, home_col = root // stride, root % stride
+    row0 = col0 = np.int64(cost.size)
+    row1 = col1 = np.int64(0)
+    for i in range(askers.size - 1, -1, -1):
+        row, col = askers[i] // stride, askers[i] % stride
+        row0, row1 = min(row0, row), max(row1, row)
+        col0, col1 = min(col0, col), max(col1, col)
+        apart = max(max(row0 - home_row, home_row - row1), max(col0 - home_col, home_col - col1))
+        boxes[i, 0], boxes[i, 1], boxes[i, 2], boxes[i, 3] = row0, col0, row1, col1
+        boxes[i, 4] = most - _AIMED * lowest * apart
+    return most
+
+
 @kernel(f"({GRID}, {BOX}, f4[::1], f4[::1], UniTuple(i8, 3), u1[::1])")
 def walk_by_costs(grid, box, crop, time_cost, ends, directions):
     """Writes the directions of a cheapest route by costs alone; of equals the first as in `parents_from_costs`.

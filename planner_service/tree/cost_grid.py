@@ -284,16 +284,18 @@ class CostGrid:
         the grid is then as it was. Costs are bounded as by `load`."""
         check_pace(self.grid, pace)
         boxes = list(self._boxes(dirty))
+        if not boxes:
+            return NO_CHANGES
         for row0, col0, row1, col1 in boxes:
             if not (pace[row0:row1, col0:col1] > 0).all():
                 raise ValueError(said_of_bad(pace, Window(row0, col0, row1, col1)))
         # A cell in two overlapping windows changes in the first only, so there is no repetition.
         found = [self._changed(pace, box, self.length_weight_s, self.cell_cost) for box in boxes]
-        if self._time_cost is not None and boxes:
+        if self._time_cost is not None:
             # A change of time may be too small to be seen in a cost that holds the price of length, too.
             timed = [self._changed(pace, box, 0.0, self._time_cost).cells for box in boxes]
             self._time_range = self._time_range.after(self._time_cost, np.concatenate(timed))
-        changes = joined([NO_CHANGES, *found])
+        changes = joined(found)
         if not changes.cells.size:
             return NO_CHANGES
         self._written[changes.cells // _BLOCK] = True

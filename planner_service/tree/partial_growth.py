@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from planner_service.kernels import queue_dial
 from planner_service.kernels.layout import NONE, TOO_FINE, WALL
-from planner_service.kernels.route_kernels import box_of, stays_exact, walk_by_costs
+from planner_service.kernels.route_kernels import box_of, find_aim, stays_exact, walk_by_costs
 from planner_service.tree.cost_changes import Cells, Changes
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.queue_choice import NARROW
@@ -19,9 +19,6 @@ from shared_map.array_files import Floats
 MOST_BUCKETS = 1 << 12
 """A growth can stop if its narrow buckets are at most this number: passing that many empty buckets costs less than
 growing a whole map. With more, each growth is whole."""
-_AIMED = 4.0
-"""No growth aims at a way of more than this many times the straight one at the lowest cost: to find which cells
-may be left out takes longer than to grow them there."""
 
 
 class CutTree(NamedTuple):
@@ -84,7 +81,7 @@ class PartialGrowth:
         self._grid = cost_grid
         self._width, self._circle = 0.0, 0
         self._scratch: queue_dial.Scratch | None = None
-        self._state = np.zeros(4, np.int64)
+        self._state = np.zeros(5, np.int64)
         self._mark = np.zeros(cost_grid.size, np.uint8)
         self.cost: Floats = np.empty(0, np.float32)
         """float32, padded, s: of the tree in hand; inf where a cell has none, WALL where it is lethal."""
@@ -118,13 +115,14 @@ class PartialGrowth:
 
     def begin(self, root: int) -> None:
         """Begins the tree of a padded, passable root."""
-        scratch = self._clear()
-        self.cost[root], scratch[0][0], self._state[:] = 0.0, root, (0, 0, 0, 1)
+        touched, *_ = self._room()
+        queue_dial.begin(self.cost, touched, self._state, root)
         self.root, self.bound = root, 0.0
 
     def resume(self, tree: CutTree, level: float) -> None:
         """Takes up a tree that was cut out, of which all that costs less than `level` (s) is as it was."""
-        scratch = self._clear()
+        self.forget()
+        scratch = self._room()
         level = min(level, tree.bound)
         if level == tree.bound < math.inf and self._width == tree.width:
             first = round(level / self._width)
@@ -138,28 +136,28 @@ class PartialGrowth:
         self.root = tree.root
         self._find_bound()
 
-    def aim_at(self, askers: Cells, root: int) -> queue_dial.Aim:
-        """Returns the aim of the next growth, from a padded, passable root to such cells: none costs more than over
-        the tree in hand and its root. `NO_AIM` if that is not known, or would leave out too few cells."""
-        grid, lowest = self._grid, self._grid.lowest_cell_cost
-        if self.root < 0 or self.bound < 0 or not askers.size:
+    def aim_at(self, askers: Cells, root: int, parent: NDArray[np.uint8]) -> queue_dial.Aim:
+        """Returns the aim of the next growth, from a padded, passable root to such cells, which it sorts. None
+        costs more than along the parents to a cell beside that root, or over the tree in hand and its root. Where
+        neither is known, no cells are left out."""
+        grid, between = self._grid, math.inf
+        if not askers.size:
             return queue_dial.NO_AIM
-        between = float(grid.cell_cost[root] + self.cost[root] - grid.cell_cost[self.root])
-        most = float(self.cost[askers].max()) + between * grid.dearest_step
-        most *= 1.0 + (most / lowest + 8.0) * 2.0**-22  # costs are rounded once for each step
-        row, col = divmod(root, grid.stride)
-        row0, col0, row1, col1 = box_of(askers.astype(np.uint32), grid.stride)
-        if not most <= _AIMED * lowest * max(row0 - row, row - (row1 - 1), col0 - col, col - (col1 - 1)):
-            return queue_dial.NO_AIM
-        return float(row0), float(col0), float(row1 - 1), float(col1 - 1), lowest, most
+        if self.root >= 0 and self.bound >= 0:
+            back = float(grid.cell_cost[root] + self.cost[root] - grid.cell_cost[self.root])
+            between = back * grid.dearest_step
+        cost = self.cost if self.root >= 0 else grid.cell_cost
+        known, boxes = (between, grid.lowest_cell_cost), np.empty((askers.size, 5), np.float32)
+        most = find_aim(grid.padded, cost, parent, askers, root, known, boxes)
+        return grid.lowest_cell_cost, most, boxes
 
     def go_on(self, askers: Cells, most: int, aim: queue_dial.Aim = queue_dial.NO_AIM) -> int:
         """Grows until these padded, passable cells have a cost, `most` more cells have one, or no cell is left.
         Returns how many more have one; -1 if costs became too large for float32: then a whole growth is left.
 
-        aim  which cells are left out. After such a growth, one that goes on begins again
+        aim  which cells are left out. After a growth that left out some, one that goes on begins again
         """
-        if self.bound == 0.0 and self.touched > 1:
+        if self._state[4] and self.touched > 1:
             self.begin(self.root)
         assert self._scratch is not None
         before, buckets = self.touched, (self._width, self._circle)
@@ -167,42 +165,28 @@ class PartialGrowth:
         last = queue_dial.grow_by_buckets(*grown, askers, most, aim)
         if last == TOO_FINE:
             return -1
-        self._find_bound(aim is not queue_dial.NO_AIM)
+        self._find_bound()
         return self.touched - before
 
-    def _find_bound(self, aimed: bool = False) -> None:
-        self.bound = 0.0 if aimed else self.reach if self._state[1] else math.inf
+    def _find_bound(self) -> None:
+        self.bound = 0.0 if self._state[4] else self.reach if self._state[1] else math.inf
 
     def cut(self) -> CutTree:
         """Returns the tree in hand, as an array of its own with a rim of cells without a cost. Then none is
         in hand."""
-        row0, col0, row1, col1 = self.box()
-        box = row0 - 1, col0 - 1, row1 + 1, col1 + 1
-        inner = self.inside(box)
-        tree = CutTree(self.root, box, inner.copy(), self.bound, self._width)
-        self._empty(inner)
-        return tree
-
-    def box(self) -> tuple[int, int, int, int]:
-        """Returns the padded rows and columns in which all cells with a cost lie."""
         assert self._scratch is not None
-        box: tuple[int, int, int, int] = box_of(self._scratch[0][: self.touched], self._grid.stride)
-        return box
+        stride = self._grid.stride
+        row0, col0, row1, col1 = box_of(self._scratch[0][: self.touched], stride)
+        box = row0 - 1, col0 - 1, row1 + 1, col1 + 1
+        inner = self.cost.reshape(-1, stride)[box[0] : box[2], box[1] : box[3]]
+        tree = CutTree(self.root, box, inner.copy(), self.bound, self._width)
+        self.forget()
+        return tree
 
     def forget(self) -> None:
         """There is no tree in hand any more. The work follows the size of the tree."""
-        if self.root >= 0:
-            self._empty(self.inside(self.box()))
-
-    def inside(self, box: tuple[int, int, int, int]) -> Floats:
-        """Returns a view of the costs of a box of padded rows and columns."""
-        row0, col0, row1, col1 = box
-        inner: Floats = self.cost.reshape(-1, self._grid.stride)[row0:row1, col0:col1]
-        return inner
-
-    def _empty(self, inner: Floats) -> None:
-        self.cost[self.root] += 1.0  # for 0 times inf is no number; WALL, if it is lethal by now, stays
-        np.multiply(inner, np.float32(np.inf), out=inner)  # what is lethal stays WALL, which is -inf
+        if self._scratch is not None:
+            queue_dial.begin(self.cost, self._scratch[0], self._state, -1)
         self.root = -1
 
     def learn(self, changes: Changes) -> None:
@@ -211,15 +195,15 @@ class PartialGrowth:
             self.bound = -1.0
             self.cost[changes.cells] = np.where(changes.after < np.inf, np.float32(np.inf), WALL)
 
-    def _clear(self) -> queue_dial.Scratch:
-        """No tree in hand, and room for one on the map as it is now, which it returns."""
-        self.forget()
+    def _room(self) -> queue_dial.Scratch:
+        """Returns room for a tree on the map as it is now."""
         width = self._narrow
         if not self.cost.size:
             self.cost = np.where(self._grid.cell_cost < np.inf, np.float32(np.inf), WALL)
         if self._scratch is None or self._width > width or self._needed(self._width) > self._circle:
             self._width = width
             self._circle = 1 << max(2, math.ceil(math.log2(self._needed(width))))
+            self.forget()
             self._scratch = queue_dial.make_scratch(self._grid.size, self._grid.rule, self._circle)
         return self._scratch
 

@@ -277,7 +277,7 @@ class GrownTree:
 
 def can_be_root(cost_grid: CostGrid, cell: int) -> bool:
     """Returns True if a tree can lead to a cell: it is one of the grid, and not lethal."""
-    return cost_grid.grid.inside(*divmod(cell, cost_grid.grid.cols)) and cost_grid.passable(cell)
+    return 0 <= cell < cost_grid.grid.cells and bool(cost_grid.cell_cost[cost_grid.pad(cell)] < np.inf)
 
 
 def growth_job(

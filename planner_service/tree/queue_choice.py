@@ -82,7 +82,7 @@ def _grow_alike(padded: PaddedGrid, bounds: Bounds, root: int, cost: Floats, kep
     if needed <= MOST_BUCKETS:
         count = 1 << max(2, math.ceil(math.log2(needed)))
         narrow = _scratch(kept, (size, count), lambda: queue_dial.make_scratch(size, rule, count))
-        state, at_once = np.empty(4, np.int64), (np.array((root,)), queue_dial.WHOLE, queue_dial.NO_AIM)
+        state, at_once = np.empty(5, np.int64), (np.array((root,)), queue_dial.WHOLE, queue_dial.NO_AIM)
         last = int(queue_dial.grow_by_buckets(padded, cost, (width, count), narrow, state, *at_once))
         if last != TOO_FINE:
             return (last + 1) * width

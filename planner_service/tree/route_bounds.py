@@ -88,9 +88,10 @@ def read_routes(
     grid = tree.cost_grid
     starts, statuses = asked.copy(), np.empty(asked.size, np.uint8)
     walks = grid.walk(tree.parent, grid.pad(tree.root), starts, max_cells, grid.time_cost, statuses)
+    rests = np.zeros(asked.size)  # of a whole route, which ends at the root
     if max_cells:
         tree.tighten(walks.last)
-    rests = tree.time_at(walks.last)
+        rests = tree.time_at(walks.last)
     cost_s = walks.driven + rests
     bound_s = bounds.at(tree, starts, None if grid.length_weight_s else cost_s)
     if grid.length_weight_s:

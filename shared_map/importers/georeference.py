@@ -84,7 +84,9 @@ def own_system(dataset: Any, what: str, path: Path | None = None) -> Any:
     """
     path = path or Path(dataset.name)
     for beside in () if dataset.crs else sorted(path.parent.glob(f"{glob.escape(path.stem)}.[pP][rR][jJ]")):
-        return system_named(read_text(beside, FileKind.SYSTEM), f"{what}: {beside}")
+        # The names in it may be in any encoding.
+        if text := read_text(beside, FileKind.SYSTEM, "latin-1").strip():
+            return system_named(text, f"{what}: {beside}")
     if not dataset.crs and "degrees_north" in dataset.tags().values():  # a latitude of netCDF, by its conventions
         return rasterio.CRS.from_epsg(4326)
     return dataset.crs

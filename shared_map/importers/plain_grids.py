@@ -25,6 +25,7 @@ from PIL import Image
 from rasterio import CRS
 from rasterio.transform import from_origin
 
+from shared_map.array_files import Floats
 from shared_map.importers.georeference import METRES, check_size
 from shared_map.importers.raster_files import LONGEST_REASON, Numbers, faults_of
 from swarm.config.explain import explain
@@ -188,13 +189,13 @@ def read_ros(path: Path) -> Numbers:
         raise TerrainError(f"terrain {path}: the origin is turned by {turned[0]:g} rad; turn the image instead")
     if free > occupied:
         raise TerrainError(f"terrain {path}: thresholds are {free:g}, {occupied:g}; expected free <= occupied")
-    pixels, brightest = _grey(image)
+    pixels = _grey(image)
     if found.negate:
-        pixels = brightest - pixels
+        pixels = 255 - pixels
     factor = np.full(pixels.shape, np.nan, np.float32)
     is_raw = found.mode == "raw"
-    known = pixels <= (100 if is_raw else brightest)
-    taken = pixels / np.float32(100) if is_raw else np.float32(1) - pixels / np.float32(brightest)
+    known = pixels <= (100 if is_raw else 255)
+    taken = pixels / np.float32(100) if is_raw else np.float32(1) - pixels / np.float32(255)
     factor[known & (taken < free)] = 1.0
     if found.mode != "trinary":
         between = known & (taken >= free) & (taken <= occupied)
@@ -206,15 +207,13 @@ def read_ros(path: Path) -> Numbers:
     return Numbers(factor, place, notes=(f"ROS map, mode {found.mode}, {np.isnan(factor).mean():.1%} unknown",))
 
 
-def _grey(path: Path) -> tuple[NDArray[np.float32], int]:
+def _grey(path: Path) -> Floats:
     """The image of a ROS map: PGM, PNG or BMP. Colours count by their mean, as in map_server.
 
     Returns
     -------
-    pixels : float32 (rows, cols)
-        Row 0 is on top; NaN where the image is transparent.
-    brightest : int
-        The value that stands for white, 255 or 65535, whatever the file says: pixels are in proportion.
+    float32 (rows, cols)
+        From 0 for black to 255 for white. Row 0 is on top; NaN where the image is transparent.
 
     Raises
     ------
@@ -226,9 +225,9 @@ def _grey(path: Path) -> tuple[NDArray[np.float32], int]:
     with faults, Image.open(path, formats=("PPM", "PNG", "BMP")) as image:
         check_size(image.height, image.width, f"image {path}")
         if image.mode in ("L", "I", "I;16"):
-            return np.asarray(image, np.float32), 255 if image.mode == "L" else 65535
+            return np.asarray(image, np.float32) / np.float32(1 if image.mode == "L" else 257)
         colours = np.asarray(image.convert("RGBA"), np.float32)
-    return np.where(colours[..., 3] > 0, colours[..., :3].mean(axis=-1), np.float32(np.nan)), 255
+    return np.where(colours[..., 3] > 0, colours[..., :3].mean(axis=-1), np.float32(np.nan))
 
 
 _LINES, _LONGEST = 10_000, 4096

@@ -38,16 +38,15 @@ _DRIVERS = {first.encode("latin-1"): key for key, row in _FORMATS.items() for fi
 DRIVERS_BY_ENDING = {ending: key for key, row in _FORMATS.items() for ending in row.get("endings", ())}
 _NAMELESS = {ending: key for ending, key in DRIVERS_BY_ENDING.items() if "nameless" in _FORMATS[key]}
 _ZIPPED = tuple(ending for ending, key in DRIVERS_BY_ENDING.items() if "zipped" in _FORMATS[key])
-_HEADER_WORD = re.compile(rb"\W*(?!(nan|inf|infinity)$)[a-z_]+", re.IGNORECASE)
-"""The first word of a line of the header of a grid as text; a value follows. Surfer's has lines of numbers."""
+_HEADER_PAIR = re.compile(rb"[\s\xef\xbb\xbf]*(?!(?:nan|inf|infinity)[\s:])([a-z_]++)(?::\s*+|\s++)(\S+)", re.I)
+"""A word of the header of a grid as text, and its value."""
 _NUMBER = re.compile(rb"[-+]?((\d+\.?\d*|\.\d+)(e[-+]?\d+)?|inf|infinity|nan)", re.IGNORECASE)
-_SURFER_LINES = 5
-"""Lines of the header of Surfer's text grid: DSAA, size, ranges of x, y and z."""
-_VOIDS, _COUNTS = {"nodata_value", "nodata", "null"}, {"ncols", "nrows", "cols", "rows", "line 2"}
-"""Header words of the no-data value, and of whole numbers; Surfer's header has lines without names."""
+_SURFER_NAMES = ("ncols", "nrows", "x from", "x to", "y from", "y to", "z from", "z to")
+_SURFER_HEADER = re.compile(rb"\S++(?:\s++\S++){8}")
+"""Surfer's header has no words but its first, DSAA."""
+_VOIDS, _COUNTS = {"nodata_value", "nodata", "null"}, {"ncols", "nrows", "cols", "rows"}
+"""Header words of the no-data value, and of whole numbers."""
 _WORDS = {*_VOIDS, "type"}
-_HEADER_LINE_BYTES = 4096
-"""Limit of a line of a header: a file without line ends is not read as one line."""
 _TEXT_PIECE_BYTES = 4 << 20
 """Bytes of a text grid that are checked at once: bounds the memory."""
 _HEAD_BYTES = 4096
@@ -157,7 +156,9 @@ def opened(path: Path, what: str, *, exact: bool = True) -> Iterator[Any]:
                 if exact and (loses or float(packed.get("MAX_Z_ERROR", 0)) > _MOST_LOSS):
                     raise TerrainError(f"{what} {path} is compressed with loss, expected exact numbers")
                 yield dataset
-    except (RasterioError, CPLE_BaseError, UnicodeError) as error:  # the last of names, also inside the file
+    except UnicodeError as error:
+        raise TerrainError(f"{what} {path}: its name, or a name in it or in its .prj, is not UTF-8") from error
+    except (RasterioError, CPLE_BaseError) as error:
         reason = str(error.__cause__ or error).strip().splitlines()[0][:LONGEST_REASON]
         raise TerrainError(f"{what} {path} is truncated or no raster: {reason}") from error
     except OSError as error:
@@ -190,7 +191,8 @@ def _georeferenced(path: Path, what: str, files: contextlib.ExitStack) -> Any:
         notes = (f"a grid as text, {driver}",)
         return in_memory(Numbers(numbers, place, own_system(dataset, what, path), notes), files)
     if dataset.transform.is_identity and dataset.gcps[0]:
-        return files.enter_context(WarpedVRT(dataset))
+        with faults_of(f"{what}: its {len(dataset.gcps[0])} control points do not place it"):
+            return files.enter_context(WarpedVRT(dataset))
     return dataset
 
 
@@ -264,24 +266,20 @@ def _skip_header(file: BinaryIO, dataset: Any, what: str) -> tuple[int, bytes | 
 
     Raises TerrainError where GDAL reads another number than the header says: 3 columns of 3.7, 0 m of `x`.
     """
-    header: dict[str, list[bytes]] = {}
-    driver, number = dataset.driver, 1
+    text, driver = file.read(_HEAD_BYTES).replace(b",", b"."), dataset.driver
     void = b"*" if driver == "GRASSASCIIGrid" else None
-    while line := file.readline(_HEADER_LINE_BYTES):
-        key, *values = line.replace(b":", b" ", 1).split() or [b""]
-        is_word = len(values) == 1 and key != void and _HEADER_WORD.fullmatch(key)
-        if not (number <= _SURFER_LINES if driver == "GSAG" else is_word or not key):
-            file.seek(-len(line), 1)
-            break
-        name = f"line {number}" if driver == "GSAG" else key.decode("ascii", "replace").lower()
+    header: dict[str, bytes] = {}
+    end, found = 0, _SURFER_HEADER.match(text)
+    if driver == "GSAG" and found:
+        header, end = dict(zip(_SURFER_NAMES, found[0].split()[1:], strict=True)), found.end()
+    while driver != "GSAG" and (pair := _HEADER_PAIR.match(text, end)) and pair[1] != void:
+        name, end = pair[1].decode().lower(), pair.end()
         if name in header:
             raise TerrainError(f"{what}: its header says {name} twice")
-        if values:
-            header[name] = [key, *values] if driver == "GSAG" else values
-        if name in _VOIDS and values:
-            void = values[-1]
-        number += 1
-    for name, word in [(name, word) for name, words in header.items() if name not in _WORDS for word in words]:
+        header[name] = pair[2]
+        void = pair[2] if name in _VOIDS else void
+    file.seek(end)
+    for name, word in ((name, word) for name, word in header.items() if name not in _WORDS):
         is_count = name in _COUNTS
         if not _NUMBER.fullmatch(word) or (is_count and number_of(word) not in dataset.shape):
             shown, kind = word[:40].decode("ascii", "replace"), "a whole number" if is_count else "a number"
@@ -289,9 +287,9 @@ def _skip_header(file: BinaryIO, dataset: Any, what: str) -> tuple[int, bytes | 
     corner = [name for name in header if name.startswith(("xll", "yll"))]
     if driver == "AAIGrid" and (len(corner), len({name[3:] for name in corner})) != (2, 1):
         raise TerrainError(f"{what}: its header needs xllcorner and yllcorner, or xllcenter and yllcenter")
-    if number_of(header.get("multiplier", [b"1"])[0]) != 1:  # which GDAL does not read
+    if number_of(header.get("multiplier", b"1")) != 1:  # which GDAL does not read
         raise TerrainError(f"{what}: its header has a multiplier; write it as a .tif")
-    return number, void
+    return text.count(b"\n", 0, end) + 1, void
 
 
 def number_of(word: str | bytes) -> float:

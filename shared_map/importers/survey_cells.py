@@ -51,6 +51,8 @@ _SMOOTH, _BEND = 1e-7, (1.0, -2.0, 1.0)
 """Weight of bends of the survey: it moves heights by less than a millimetre where the sums determine them."""
 _AT_ONCE = 256
 """Columns that are solved together: their sums take some megabytes."""
+_ROUNDINGS_M, _MOSTLY, _OFF = (0.1, 0.25, 0.5, 1.0), 0.9, 0.125
+"""Usual roundings of heights. The coarsest that fits counts: 0.9 of all heights lie within an eighth of it."""
 
 
 def _linear(t: _Doubles) -> _Doubles:
@@ -106,7 +108,7 @@ def surveyed(elevation_m: Floats) -> tuple[Floats, NDArray[np.intp], NDArray[np.
 
         nearest = ndimage.distance_transform_edt(void, return_distances=False, return_indices=True)
         heights_m = elevation_m[tuple(nearest)]
-    of_line = []
+    filled_m, of_line, is_cubic = heights_m, [], False
     for _ in range(2):
         at = _repeated(heights_m)
         if at[-1] + 1 < len(at):
@@ -114,13 +116,23 @@ def surveyed(elevation_m: Floats) -> tuple[Floats, NDArray[np.intp], NDArray[np.
         elif (found := _resampling_of(heights_m)) is not None:
             at = np.rint(found.at(len(heights_m))).astype(np.intp)
             heights_m = _recovered(heights_m, found)
-            at = np.clip(at - at[0] - _REACH, 0, len(heights_m) - 1)
+            at -= at[0]
+            is_cubic |= found.kernel is _cubic
         of_line.append(at)
         heights_m = heights_m.T
     rows, cols = of_line
     if heights_m.shape == elevation_m.shape:
         return elevation_m, rows, cols
     heights_m = np.ascontiguousarray(heights_m)
+    if is_cubic:  # which is linear at the border: the lowest of its sums is as high as the water in it
+        starts = [np.unique(at, return_index=True)[1] for at in of_line]
+        for line in (0, -1):
+            heights_m[line] = np.minimum.reduceat(filled_m[line], starts[1])
+            heights_m[:, line] = np.minimum.reduceat(filled_m[:, line], starts[0])
+    for step_m in _ROUNDINGS_M:
+        whole_m = np.rint(heights_m / np.float32(step_m)) * np.float32(step_m)
+        if (np.abs(heights_m - whole_m) < _OFF * step_m).mean() > _MOSTLY:
+            heights_m = whole_m
     if void.any():
         heights_m[rows[:, None].repeat(len(cols), 1)[void], cols[None].repeat(len(rows), 0)[void]] = np.nan
     return heights_m, rows, cols
@@ -231,18 +243,23 @@ def _refined(lines: _Doubles, found: _Resampling, start: int, cells: int) -> _Re
 
 
 def _recovered(heights_m: Floats, by: _Resampling) -> Floats:
-    """The survey in the direction of columns, without `_REACH` cells at either end.
+    """The survey in the direction of columns.
 
-    At the border of its file a filter has fewer cells to weigh.
+    Beyond the border of its file a filter has no cells to weigh. GDAL's cubic filter is a linear one there, whose
+    outermost sums are those of one surveyed cell; they are taken as they are.
     """
-    outer = round(_REACH / by.step)
-    ends = np.rint(by.at(len(heights_m))[[0, -1]]).astype(np.intp)
-    by = by.moved(outer)
-    first = int(np.floor(by.at(1)[0])) + 1 - _REACH
-    inner = slice(ends[0] + _REACH - first, ends[1] + 1 - _REACH - first)
+    at = by.at(len(heights_m))
+    first, last = np.rint(at[[0, -1]]).astype(np.intp)
+    cut, start, stop = 0, 0, len(at)
+    if by.kernel is _cubic:
+        cut, start, stop = 1, int((at < first + 1).sum()), int((at < last - 1.01).sum())
+    by = by.moved(start)
+    before = int(np.floor(at[start])) + 1 - _REACH
+    inner = slice(first + cut - before, last + 1 - cut - before)
     middle_m = np.float64(heights_m.mean())
-    parts = [heights_m[outer:-outer, n : n + _AT_ONCE] for n in range(0, heights_m.shape[1], _AT_ONCE)]
-    return np.hstack([(_solved(part - middle_m, by)[0][inner] + middle_m).astype(np.float32) for part in parts])
+    parts = [heights_m[start:stop, n : n + _AT_ONCE] for n in range(0, heights_m.shape[1], _AT_ONCE)]
+    solved_m = np.hstack([(_solved(part - middle_m, by)[0][inner] + middle_m).astype(np.float32) for part in parts])
+    return np.vstack((heights_m[:cut], solved_m, heights_m[len(at) - cut :]))
 
 
 def _solved(heights_m: _Doubles, by: _Resampling) -> tuple[_Doubles, _Doubles, NDArray[np.intp]]:

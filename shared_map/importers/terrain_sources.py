@@ -189,8 +189,8 @@ def without_voids(source: Source, config: TerrainConfig) -> Source:
     share = count / elevation_m.size
     if share == 1.0 and np.isfinite(some_m).any():
         found = f"{np.nanmin(some_m):g} to {np.nanmax(some_m):g}"
-        how = "of centimetres set terrain.height_scale = 0.01"
-        raise TerrainError(f"terrain {config.source} has heights of {found} m: {how}")
+        how = f"terrain.height_scale ({config.height_scale or 1:g}; of centimetres 0.01) to the metres of its unit"
+        raise TerrainError(f"terrain {config.source} has heights of {found} m, expected less than 20 km: set {how}")
     if share == 1.0:
         raise TerrainError(f"terrain {config.source} has no heights at all: every cell is void, NaN or infinite")
     if config.nodata == "fill":

@@ -186,8 +186,6 @@ _TOLD_SHARE = 0.001
 """The note has one decimal of a percent: a smaller share would be shown as 0.0 or 0.1 %."""
 _MUCH_WATER = 0.05
 """Share of the terrain from which on many small lakes are doubted: filled sinks. Chosen, not measured."""
-_ROUNDINGS_M, _LEAST_HEIGHTS, _MOSTLY = (1.0, 0.5, 0.25, 0.1), 5, 0.9
-"""Usual roundings of heights. They count if 0.9 of all level cells, at five heights or more, lie on one."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -241,11 +239,8 @@ def level_ground(elevation_m: Floats) -> LevelGround:
 def _at_one_scale(elevation_m: Floats) -> tuple[Bools, list[tuple[float, int]], Bools]:
     """Returns (mask of water, (height in m, cells) of each patch of it, mask of large level patches)."""
     step_m = _step_m(elevation_m)
-    found = _level_with(elevation_m, step_m)
-    rounded_m = _rounded_m(found)
-    if rounded_m > step_m:
-        step_m = rounded_m
-        found = _level_with(elevation_m, step_m)
+    least_cells = _LEAST_CELLS_COARSE if step_m >= _COARSE_M else _LEAST_CELLS_FINE
+    found = level_patches(elevation_m, _SAME_M, least_cells)
     water, unsure = _judged(found, elevation_m, _SAME_M, _STILL_M, step_m)
     mask: Bools = water[found.labels]
     large = unsure | (found.cells > _TOLD_SHARE * elevation_m.size)
@@ -254,23 +249,6 @@ def _at_one_scale(elevation_m: Floats) -> tuple[Bools, list[tuple[float, int]], 
     if step_m < _ROUGH_M / _BLOCK_CELLS:
         patches += _rough_water(elevation_m, mask)
     return mask, patches, large[found.labels]
-
-
-def _level_with(elevation_m: Floats, step_m: float) -> Patches:
-    """The level patches of heights that are rounded to `step_m`."""
-    return level_patches(elevation_m, _SAME_M, _LEAST_CELLS_COARSE if step_m >= _COARSE_M else _LEAST_CELLS_FINE)
-
-
-def _rounded_m(found: Patches) -> float:
-    """Returns what the heights of patches are rounded to, m, or 0: a resampling hides it between the patches."""
-    heights, cells = found.height_m[1:].astype(np.float64), found.cells[1:]
-    if np.unique(np.round(heights, 2)).size < _LEAST_HEIGHTS:
-        return 0.0
-    for step_m in _ROUNDINGS_M:
-        off_m = np.abs(heights - np.rint(heights / step_m) * step_m)
-        if cells[off_m < 2 * _SAME_M].sum() > _MOSTLY * cells.sum():
-            return step_m
-    return 0.0
 
 
 def _judged(

@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from shared_map.terrain.pace_layers import TerrainClass
 from shared_map.terrain.row_bands import Progress, no_progress
 from shared_map.terrain.terrain import Terrain, finished
-from swarm.bus.bus import Asked, Bus, Event
+from swarm.bus.bus import Asked, Bus, Event, LinkChanged
 from swarm.config.ground import CostConfig
 from swarm.errors import ProtocolError, TerrainError
 from swarm.grid import REGION_CELLS, GridSpec, Window
@@ -56,6 +56,8 @@ _PIECES_KEPT = 1024
 """Packed pieces that a keeper keeps, at most 64 MiB: machines often start together."""
 _LONGEST_WAIT_S = 3600.0
 """Time after which the thread that waits for questions looks again: any, as a question wakes it."""
+_STOP_S = 2.0
+"""Longest wait for the question in hand at the end (s): `_PIECES_PER_REQUEST` take less unless the router hangs."""
 _PIECES_PER_REQUEST = 64
 """Pieces of at most 64 KiB each: the largest cost of one reply to a keeper."""
 
@@ -81,8 +83,11 @@ class BaseMapServer:
         self._keeper = keeper
         self._packed = lru_cache(_PIECES_KEPT)(self.pack)
         self._inbox = Inbox()
+        self._thread: threading.Thread | None = None
+        """Started by the first question."""
         self._starts = threading.Lock()
-        """Taken for good by the first question, which starts the thread."""
+        """Taken for good by the one who starts it."""
+        self._ended = threading.Event()
 
     def start(self, bus: Bus) -> None:
         """Serves the description, and pieces."""
@@ -96,10 +101,19 @@ class BaseMapServer:
             return
         self._inbox.post(event)
         if self._starts.acquire(blocking=False):
-            threading.Thread(target=self._work, name="base-map", daemon=True).start()
+            self._thread = threading.Thread(target=self._work, name="base-map", daemon=True)
+            self._thread.start()
+
+    def stop(self) -> None:
+        """Ends the thread after the question in hand. One that returns from Zenoh after the interpreter has ended
+        aborts the process."""
+        self._ended.set()
+        if self._thread is not None:
+            self._inbox.post(LinkChanged(up=False))  # any event wakes it
+            self._thread.join(_STOP_S)
 
     def _work(self) -> None:
-        while True:
+        while not self._ended.is_set():
             if isinstance(event := self._inbox.take(_LONGEST_WAIT_S), Asked):
                 self._answer(event)
 

@@ -146,6 +146,8 @@ class SealedDatabase:
         before, seal = self._sum, self._seal
         try:
             with self._db:
+                if self._lock is not None and seal.last:
+                    self._check_own()
                 yield
                 if self._sum != before:
                     digest = self._sum.to_bytes(DIGEST_BYTES, "little")
@@ -161,6 +163,16 @@ class SealedDatabase:
         self._seal = seal
         if self._lock is not None:
             self._lock.witness(seal)
+
+    def _check_own(self) -> None:
+        """Begins a transaction. Raises DamagedError if another process has written the file, which only a deleted
+        lock lets it: its rows are not in our sum."""
+        self._db.execute("BEGIN IMMEDIATE")
+        row = self._db.execute("SELECT value FROM meta WHERE key = ?", (_SEAL,)).fetchone()
+        if row is None or row[0] != self._seal.packed().hex():
+            raise DamagedError(
+                f"the store {self.path} was written by another keeper; was {self.path}.lock deleted?"
+            )
 
     @contextmanager
     def _reading(self, what: str = "") -> Iterator[None]:

@@ -181,6 +181,7 @@ class KeeperService(MemberService):
         self._member.tick(now_ns)
 
     def stop(self, now_ns: int) -> None:
+        self._base_map.stop()
         self._sync.take_in(now_ns)
         self._save(now_ns)
         self._member.publish_stats(now_ns)

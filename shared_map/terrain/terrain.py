@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import hashlib
 from dataclasses import dataclass, field, replace
+from os import PathLike
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -24,6 +25,7 @@ from shared_map.terrain.pace_layers import TerrainClass
 from shared_map.terrain.row_bands import Progress, in_bands, no_progress, padded_rows
 from shared_map.terrain.slope_and_climb import Climb, climb_of, said_of_cost
 from shared_map.terrain.zones import ZoneFacts, paint_zones
+from swarm.config.explain import converted
 from swarm.config.ground import CostConfig
 from swarm.config.scenario import Scenario
 from swarm.config.vehicle_classes import GROUND, of_class
@@ -76,9 +78,12 @@ class Terrain:
 
 
 def build_terrain(scenario: Scenario, progress: Progress = no_progress, vehicle_class: str = GROUND) -> Terrain:
-    """The terrain of a scenario, for one of its classes of vehicles. Raises TerrainError with one sentence."""
+    """The terrain of a scenario, for one of its classes of vehicles. Raises TerrainError with one sentence, or
+    ConfigError on a setting that no file may have."""
     from shared_map.importers.terrain_sources import load_source
 
+    if isinstance(scenario.terrain.source, str | PathLike):  # of an array the reader says what to do
+        scenario = converted(scenario, Scenario, "the scenario")  # which may have been made in Python
     try:
         source = load_source(scenario.terrain, scenario.seed, progress)
         return _built(of_class(scenario, vehicle_class), source, progress, scenario.cost)

@@ -43,7 +43,7 @@ from swarm.errors import ProtocolError
 from swarm.peers import Peer
 from swarm.wire.codec import KEY_FIELD, MAX_PAYLOAD_BYTES
 from swarm.wire.messages import Message
-from swarm.wire.topics import NO_ASKER, TOPICS, Topic
+from swarm.wire.topics import NO_ASKER, TOPICS, UNPROVEN, Topic
 
 SHARED = frozenset(
     kind for kind, uses in Counter(topic.message for topic in TOPICS if topic.published).items() if uses > 1
@@ -148,7 +148,8 @@ class Question:
     topic: Topic
     answerer: Answerer
     asker: str
-    """Name of the asker, as its key says; "" if the key names none."""
+    """Name of the asker, as its key says: marked (`UNPROVEN`) without a code or a certificate; "" if the key names
+    none."""
 
     @property
     def timeout_s(self) -> float:
@@ -194,7 +195,8 @@ class Asked(Question):
     def answer(self, message: Message, **fields: str | int) -> None:
         """Sends one reply. `fields` complete the key where `serve` left wildcards, beside the asker; a reply whose
         key is not among those asked for is not sent. Raises RuntimeError after `end`."""
-        asker = {"asker": self.asker or NO_ASKER} if "asker" in self.topic.fields else {}
+        name = self.asker.removeprefix(UNPROVEN) or NO_ASKER
+        asker = {"asker": name} if "asker" in self.topic.fields else {}
         self.answerer.answer(message, {**asker, **fields})
 
 
@@ -211,7 +213,7 @@ class Undecoded(Question):
     asker: str = ""
 
 
-_NAME = re.compile(r"[A-Za-z0-9_.-]{1,129}")
+_NAME = re.compile(f"{UNPROVEN}?[A-Za-z0-9_.-]{{1,129}}")
 
 
 def asker_in(fields: Mapping[str, str]) -> str:

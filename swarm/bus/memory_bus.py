@@ -36,10 +36,10 @@ from swarm.bus.scheduler import Scheduler
 from swarm.clock import NS_PER_S
 from swarm.errors import ProtocolError
 from swarm.peers import Peer
-from swarm.wire.access import Authenticator, check_code, code_of
+from swarm.wire.access import Authenticator, check_code, code_of, has_code
 from swarm.wire.codec import decode, decode_either, encode
 from swarm.wire.messages import Message
-from swarm.wire.topics import TOPICS, Topic, check_size
+from swarm.wire.topics import TOPICS, Topic, check_size, proven_asker
 
 # One query on the simulated network: which queryables have not ended yet, and how their answers travel.
 
@@ -128,7 +128,7 @@ class MemoryAnswerer:
             if asking.over:
                 return
             try:
-                check_size(payload, asking.topic.answer_bytes)
+                check_size(len(payload), asking.topic.answer_bytes)
                 check_code(asking.bus.authenticator, code, asking.topic, "answer", key, payload, asking.asked)
             except ProtocolError as error:
                 asking.bus.counts[counter_of(error)] += 1
@@ -565,7 +565,7 @@ class MemoryBus:
         """Posts a question that has come under a key, or refuses it."""
         assert queryable.post is not None
         try:
-            check_size(payload, event.topic.ask_bytes)
+            check_size(len(payload), event.topic.ask_bytes)
             check_meant(key, payload)
             check_code(self.authenticator, code, event.topic, "ask", key, payload)
         except ProtocolError as error:
@@ -573,6 +573,9 @@ class MemoryBus:
             event.refuse(f"{event.topic.name}: {error}")
             event.end()
         else:
+            if event.topic.costly:
+                proven = has_code(self.authenticator, code, key, payload)
+                event = replace(event, fields=proven_asker(event.fields, proven))
             queryable.post(event)
 
     def declare_alive(self, peer: Peer) -> None:
@@ -688,7 +691,7 @@ class _Sample:
     def parse(self) -> None:
         payload, kind = self.payload, self.topic.message
         try:
-            check_size(payload, self.topic.put_bytes)
+            check_size(len(payload), self.topic.put_bytes)
             check_meant(self.key, payload)
             event = Heard(self.topic, self.fields, decode(payload, kind))
         except ProtocolError as error:

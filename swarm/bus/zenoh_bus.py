@@ -11,6 +11,7 @@ from __future__ import annotations
 import atexit
 import contextlib
 import logging
+import os
 import threading
 import time
 from collections import deque
@@ -47,29 +48,39 @@ from swarm.peers import Peer
 from swarm.wire.access import Authenticator, code_of
 from swarm.wire.codec import decode_either, encode, encode_json
 from swarm.wire.messages import Message
-from swarm.wire.topics import ALIVE_KEY, Priority, Topic, check_size, peer_of
+from swarm.wire.topics import ALIVE_KEY, Priority, Topic, check_size, peer_of, proven_asker
 
 
 class ZenohAnswerer:
     """The `Answerer` of one query, which arrives when this is made. `_query` is None after the end.
 
     concrete  fields of the key that the queryable serves
-    fault     why the query is rejected, if its timeout is none
+
+    size   bytes of the request: its payload and its parameters, which are parsed in its turn
+    fault  why the query is rejected, if it is too long, or its timeout is none
     """
 
     def __init__(self, bus: ZenohBus, topic: Topic, concrete: Mapping[str, str], query: zenoh.Query) -> None:
         self._bus, self._topic, self._concrete = bus, topic, concrete
+        # A tool may ask with `**`, which no key template parses: all that we serve is meant.
+        parsed = topic.parse(bus.namespace, str(query.key_expr))
+        self.fields: Mapping[str, str] = parsed or {**dict.fromkeys(topic.fields, "*"), **concrete}
+        """The fields of the key that is asked."""
         self._query: zenoh.Query | None = query
         self._arrived_s = time.monotonic()
         self._asked = b"" if query.payload is None else query.payload.to_bytes()
-        self._parameters = dict(list(query.parameters))  # type: ignore[call-overload]
-        self._as_json = zenoh_intake.is_json(query, self._asked) or self._parameters.get("format") == "json"
-        self._fault: ProtocolError | None = None
+        parameters = query.parameters
+        self.size = len(self._asked) + len(str(parameters))
+        self._as_json = zenoh_intake.is_json(query, self._asked) or parameters.get("format") == "json"
+        self.fault: ProtocolError | None = None
         self.timeout_s = USUAL_TIMEOUT_S
         try:
-            self.timeout_s = zenoh_intake.timeout_of(self._parameters.pop(TIMEOUT_PARAMETER, ""))
+            check_size(self.size, topic.ask_bytes)
+            self.timeout_s = zenoh_intake.timeout_of(parameters.get(TIMEOUT_PARAMETER) or "")
+            if topic.costly:
+                self.fields = proven_asker(self.fields, bus.intake.proves(query, self._asked))
         except ProtocolError as error:
-            self._fault = error
+            self.fault = error
 
     def decoded(self) -> Asked | None:
         """Returns the query, decoded; None if it is rejected, which ends the query."""
@@ -78,22 +89,15 @@ class ZenohAnswerer:
         key = str(query.key_expr)
         intake.received(self._asked)
         try:
-            if self._fault is not None:
-                raise self._fault
-            request = intake.request(topic, query, self._asked, self._parameters)
+            if self.fault is not None:
+                raise self.fault
+            request = intake.request(topic, query, self._asked)
         except ProtocolError as error:
             intake.drop(topic.name, key, error)
             self.refuse(f"{topic.name}: {error}")
             self.end()
             return None
-        # A tool may ask with `**`, which no key template parses: all that we serve is meant.
-        asked = topic.parse(self._bus.namespace, key) or {**dict.fromkeys(topic.fields, "*"), **self._concrete}
-        return Asked(topic, asked, request, self)
-
-    @property
-    def size(self) -> int:
-        """Bytes of the request."""
-        return len(self._asked)
+        return Asked(topic, self.fields, request, self)
 
     def waited_s(self) -> float:
         return time.monotonic() - self._arrived_s
@@ -133,6 +137,9 @@ _PRIORITIES = {
     Priority.DATA: zenoh.Priority.DATA,
     Priority.BACKGROUND: zenoh.Priority.BACKGROUND,
 }
+_ACCEPTORS = "(acc: (worker_threads: 32))"
+"""Threads of a router that take connections in, as Zenoh's variable says it. Each connection whose first message is
+wrong keeps one for 45 ms, as its socket lingers: with Zenoh's single thread 100 of them delay a join by 4.6 s."""
 _CLOSE_S = 3.0
 """Time for which `close` waits for an unresponsive router (s)."""
 
@@ -152,6 +159,8 @@ def open_bus(
     authenticator  makes and checks the codes of messages
     """
     endpoints = network.listen if mode == "router" else network.connect
+    if mode == "router":
+        os.environ.setdefault("ZENOH_RUNTIME", _ACCEPTORS)
     warned, kept_open = False, 0
     while True:
         if patient:
@@ -310,11 +319,10 @@ class ZenohBus:
             answerer = ZenohAnswerer(self, topic, concrete, query)
             if not self.intake.concerns(query):
                 answerer.end()
-            elif answerer.size > topic.ask_bytes:
+            elif answerer.fault is not None:
                 answerer.decoded()  # which rejects it
             else:
-                asker = asker_in(topic.parse(self.namespace, str(query.key_expr)) or {})
-                post(Undecoded(topic, answerer, answerer.decoded, asker))
+                post(Undecoded(topic, answerer, answerer.decoded, asker_in(answerer.fields)))
 
         expression = self._pattern(topic, fields)
         queryable = self.session.declare_queryable(expression, _calling(enter))
@@ -343,7 +351,7 @@ class ZenohBus:
             key = str(reply.ok.key_expr)
             try:
                 payload = reply.ok.payload.to_bytes()
-                check_size(payload, topic.answer_bytes)
+                check_size(len(payload), topic.answer_bytes)
                 check_meant(self.intake.below(key), payload)
                 self.intake.check(topic, "answer", key, reply.ok, payload, asked)
                 message = decode_either(payload, topic.message, topic.bulk)

@@ -18,7 +18,7 @@ from swarm.bus import bus
 from swarm.bus.bus import SHARED, check_meant, check_named
 from swarm.errors import ProtocolError
 from swarm.wire import codec
-from swarm.wire.access import Act, Authenticator, check_code
+from swarm.wire.access import Act, Authenticator, check_code, has_code
 from swarm.wire.messages import Message
 from swarm.wire.topics import Topic, check_size
 
@@ -91,6 +91,11 @@ def timeout_of(stated: str) -> float:
     if not timeout_s > 0:  # neither is NaN
         raise ProtocolError(f"{bus.TIMEOUT_PARAMETER} {stated[:40]!r} is not a positive number of seconds")
     return min(timeout_s, bus.LONGEST_TIMEOUT_S)
+
+
+def _code(carrier: Any) -> bytes | None:
+    """The code beside a payload."""
+    return None if carrier.attachment is None else carrier.attachment.to_bytes()
 
 
 log = logging.getLogger(__name__)
@@ -169,12 +174,13 @@ class Intake:
             else:
                 yield key, payload
 
-    def request(self, topic: Topic, query: zenoh.Query, asked: bytes, parameters: dict[str, str]) -> Message:
+    def request(self, topic: Topic, query: zenoh.Query, asked: bytes) -> Message:
         """Decodes a query with the payload `asked`. Raises ProtocolError."""
         key, wanted = str(query.key_expr), topic.request
         assert wanted is not None
-        check_size(asked, topic.ask_bytes)
         if query.payload is None:
+            parameters = dict(list(query.parameters))  # type: ignore[call-overload]
+            parameters.pop(bus.TIMEOUT_PARAMETER, None)
             check_named(self.below(key), parameters.pop(codec.KEY_FIELD, None))
             self.check(topic, "ask", key, query, asked)
             return codec.decode_parameters(parameters, wanted)
@@ -186,7 +192,7 @@ class Intake:
     def _checked(self, topic: Topic, key: str, sample: zenoh.Sample, payload: bytes) -> bytes:
         """A payload as MessagePack, which is short enough, is meant for its key and has the code that its topic
         needs. Raises ProtocolError."""
-        check_size(payload, topic.put_bytes)
+        check_size(len(payload), topic.put_bytes)
         in_json = is_json(sample, payload)
         packed = codec.packed_json(payload, topic.message, self.fields(topic, key)) if in_json else payload
         check_meant(self.below(key), packed, must=in_json and topic.message in SHARED)
@@ -202,8 +208,11 @@ class Intake:
 
         asked  the payload of the question, where this is an answer
         """
-        code = None if carrier.attachment is None else carrier.attachment.to_bytes()
-        check_code(self.authenticator, code, topic, act, key, payload, asked)
+        check_code(self.authenticator, _code(carrier), topic, act, key, payload, asked)
+
+    def proves(self, query: zenoh.Query, asked: bytes) -> bool:
+        """Returns True if the asker of a query is who its key says."""
+        return has_code(self.authenticator, _code(query), str(query.key_expr), asked)
 
     def fields(self, topic: Topic, key: str) -> dict[str, str]:
         """Parses the fields of a key. Raises ProtocolError where it is none of the topic's."""

@@ -6,8 +6,10 @@ Errors of a scenario are stated in these terms: the key, the value found, the va
 
 from __future__ import annotations
 
+import datetime
 import difflib
 import inspect
+import os
 import re
 import types
 import typing
@@ -205,17 +207,33 @@ def explain(reason: str, raw: dict[str, Any], root: type, whole: str = "scenario
 
 
 def converted(
-    raw: dict[str, Any], root: type[T], source: str, whole: str = "scenario", fault: type[SwarmError] = ConfigError
+    given: Any, root: type[T], source: str, whole: str = "scenario", fault: type[SwarmError] = ConfigError
 ) -> T:
-    """The content of a file as the type that it is to become. Raises `fault` in one sentence.
+    """The content of a file, or settings from Python, as the type that they are to become. Raises `fault` in one
+    sentence.
 
     source  begins that sentence
     whole   what the file is called
     """
+    raw: Any = None
     try:
+        raw = msgspec.to_builtins(given, builtin_types=_DATES, enc_hook=_plain)
         return msgspec.convert(raw, root)
     except msgspec.ValidationError as error:
         raise fault(f"{source}: {explain(str(error), raw, root, whole)}") from error
+    except (TypeError, OverflowError, RecursionError) as error:
+        raise fault(f"{source}: a value of it is none that a file may have: {error}") from error
+
+
+_DATES = (datetime.datetime, datetime.date, datetime.time, bytes)
+"""Types that are no text, though JSON has texts for them."""
+
+
+def _plain(value: Any) -> Any:
+    """A value of Python as a file has it: numbers of NumPy's are numbers, paths are texts."""
+    if isinstance(value, os.PathLike):
+        return os.fspath(value)
+    return value.tolist() if hasattr(value, "tolist") else [type(value).__name__]
 
 
 def _is_refused(value: Any, hint: Any) -> bool:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import threading
 from collections import OrderedDict, deque
 from collections.abc import Callable, Hashable
@@ -10,7 +11,7 @@ from heapq import heapify, heappop, heappush
 from typing import Generic, TypeVar
 
 from swarm.bus import bus
-from swarm.wire.topics import is_own
+from swarm.wire.topics import rank_of
 
 T = TypeVar("T")
 
@@ -65,9 +66,10 @@ class FairQueue(Generic[T]):
     def __len__(self) -> int:
         return sum(map(len, self._order.values()))
 
-    def comes_before(self, rank: int) -> bool:
-        """Returns True if an item of a lower rank waits."""
-        return any(order for each, order in self._order.items() if each < rank)
+    @property
+    def first_rank(self) -> float:
+        """The lowest rank of an item that waits; inf without any."""
+        return min((rank for rank, order in self._order.items() if order), default=math.inf)
 
     def put(self, sender: str, item: T, *, price: int = 1, rank: int = 0) -> list[T]:
         """Adds an item. Returns those which are dropped for it.
@@ -176,8 +178,8 @@ class Inbox:
                their key (`Topic.newest`) only the newest per key is kept, in the place of the oldest unread one.
     Questions  `QUESTION_BYTES` in all: then the oldest of those that come last is refused. A quarter of that per
                asker: then its oldest is. One whose asker has left is refused, too. One that is `Undecoded` is
-               decoded in its turn. Askers take turns and pay by bytes; on a costly topic agents come before
-               others, and askers without a name share one turn.
+               decoded in its turn. Askers take turns and pay by bytes; on a costly topic agents come first,
+               then other proven names, and askers without a name share one turn.
     The rest   is never dropped: replies, ends of our own questions, tokens, links, results of workers, errors.
 
     Events are taken in the order of their arrival, if only one asker asks. While a question comes late (`LATE_S`),
@@ -250,7 +252,7 @@ class Inbox:
         """Adds a question. Returns the questions which were dropped to make room."""
         costly = question.topic.costly
         asker = question.asker or (_NAMELESS if costly else f"{_NAMELESS}{question.topic.name}")
-        rank = 1 if costly and not is_own(asker) else 0
+        rank = rank_of(question.asker) if costly else 0
         with self._lock:
             self._next += 1
             self._queues.setdefault(_ASKED, OrderedDict())

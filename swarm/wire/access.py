@@ -114,6 +114,16 @@ def code_of(authenticator: Authenticator | None, key: str, payload: bytes, asked
     return None if authenticator is None else authenticator.code(key, payload, asked)
 
 
+def has_code(
+    authenticator: Authenticator | None, code: bytes | None, key: str, payload: bytes, asked: bytes = b""
+) -> bool:
+    """Returns True if a process of the run has made this code; always without an authenticator, as then
+    certificates prove names."""
+    if authenticator is None:
+        return True
+    return code is not None and hmac.compare_digest(code, authenticator.code(key, payload, asked))
+
+
 def check_code(
     authenticator: Authenticator | None,
     code: bytes | None,
@@ -128,6 +138,6 @@ def check_code(
         return
     if not payload:
         raise ProtocolError("its fields are not in a payload, which alone a code can cover")
-    if code is None or not hmac.compare_digest(code, authenticator.code(key, payload, asked)):
+    if not has_code(authenticator, code, key, payload, asked):
         what = "no code" if code is None else "a false code"
         raise ProtocolError(f"it carries {what}, so no process of this run has said it")

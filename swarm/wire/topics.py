@@ -146,10 +146,10 @@ class Topic:
                 raise ProtocolError(f"{name} is {stated[:80]!r} in the message and {fields[name]!r} in its key")
 
 
-def check_size(payload: bytes, most_bytes: int) -> None:
+def check_size(size: int, most_bytes: int) -> None:
     """Raises ProtocolError on a payload which is longer than its topic allows, before anything reads it."""
-    if len(payload) > most_bytes:
-        raise ProtocolError(f"payload of {len(payload):,} bytes, at most {most_bytes:,}")
+    if size > most_bytes:
+        raise ProtocolError(f"payload of {size:,} bytes, at most {most_bytes:,}")
 
 
 _CHUNK = re.compile(r"[^/*$?#\s]+|\*")
@@ -534,9 +534,22 @@ def asker_of(role: str, id: str) -> str:
     return f"{role}.{id}"
 
 
-def is_own(asker: str) -> bool:
-    """Returns True if an asker is an agent of the run: its questions come before those of others."""
-    return asker.startswith("agent.")
+UNPROVEN = "~"
+"""Stands before the name of an asker that no code proves. No name has this character."""
+
+
+def proven_asker(fields: Mapping[str, str], proven: bool) -> Mapping[str, str]:
+    """The fields of the key of a question, with the asker's name marked if it is not proven."""
+    name = fields.get("asker", "*")
+    return fields if proven or name == "*" else {**fields, "asker": UNPROVEN + name}
+
+
+def rank_of(asker: str) -> int:
+    """The class of priority of an asker: 0 for agents of the run, which come first, 1 for other proven names, 2 for
+    the rest."""
+    if asker.startswith("agent."):
+        return 0
+    return 1 if asker and not asker.startswith(UNPROVEN) else 2
 
 
 def peer_of(key: str) -> Peer:

@@ -3,6 +3,7 @@ claim."""
 
 import math
 import time
+from typing import Any
 
 import numpy as np
 import pytest
@@ -16,7 +17,7 @@ from support.tree_lives import Findings, Life, lives
 from planner_service.kernels.layout import NONE
 from planner_service.kernels.tile_pieces import MOST_SLACK
 from planner_service.target_tree import TargetTree
-from planner_service.tree.cost_grid import CostGrid
+from planner_service.tree.cost_grid import CostGrid, Walks
 from planner_service.tree.cost_to_go import CostToGoTree
 from planner_service.tree.partitioned_tree import PartitionedTree
 from planner_service.tree.route_bounds import LowerBounds, read_routes
@@ -48,8 +49,13 @@ def test_no_life_of_many_breaks_a_law() -> None:
 
 
 def test_a_stated_cost_that_is_not_driven_is_counted(monkeypatch: pytest.MonkeyPatch) -> None:
-    true = CostToGoTree.time_at
-    monkeypatch.setattr(CostToGoTree, "time_at", lambda tree, cells: true(tree, cells) * (1 + 1e-5) + 1e-5)
+    true = CostGrid.walk
+
+    def dearer(*asked: Any) -> Walks:
+        walks = true(*asked)
+        return walks._replace(driven=walks.driven * (1 + 1e-5) + 1e-5)
+
+    monkeypatch.setattr(CostGrid, "walk", dearer)
     found = checked(range(2)).violations
     assert found["stated"] > 0
     assert found["cut"] > 0

@@ -9,6 +9,7 @@ from support.planner_strategies import RULES, random_climb, random_pace
 from planner_service.goal_tree_cache import GoalTrees
 from planner_service.kernels.queue_dial import NO_AIM
 from planner_service.target_tree import TargetTree
+from planner_service.tree.cost_to_go import CostToGoTree
 from planner_service.tree.partial_growth import PartialGrowth
 from swarm.config.scenario import PlannerConfig, Strategy
 from swarm.grid import GridSpec, Window
@@ -41,34 +42,41 @@ def test_a_growth_that_stops_is_exact_where_it_was_and_bounds_the_rest(rules: di
         pace = random_pace(rng, *rng.integers(5, 40, 2), (1.0, 3.0, 40.0, 900.0)[n % 4], WALLS[n % 4])
         ground, goal = loaded(pace, **rules), open_cell(rng, pace)
         best = naive.cost_to_go(pace, goal, **rules).reshape(-1)
-        growth = PartialGrowth(ground)
+        growth, ways = PartialGrowth(ground), CostToGoTree(ground)
         growth.begin(ground.pad(goal))
         farthest, asker = 0.0, goal
         for _ in range(12):
             changes, most, aim = rng.random() < 0.2, int(rng.choice([1 << 40, 1, 30])), NO_AIM
+            askers = None
             if changes:
                 growth.learn(ground.apply(pace, [marked(rng, pace, 2.0) for _ in range(20)]))
+            if np.isfinite(pace.flat[goal]) and rng.random() < 0.7:  # else its parents are of an older map and root
+                ways.grow(goal)
             if rng.random() < 0.5 or np.isinf(pace.flat[asker]):
                 asker = open_cell(rng, pace)
             if changes or rng.random() < 0.3:  # the target moves
                 beside = [cell for _, cell in ground.grid.neighbours(goal) if np.isfinite(pace.flat[cell])]
                 goal = int(rng.choice(beside or [open_cell(rng, pace)]))
-                aim = growth.aim_at(np.array([ground.pad(asker)]), ground.pad(goal))
+                more = [open_cell(rng, pace) for _ in range(rng.integers(0, 4))]
+                askers = ground.pad_all(np.array([asker, *more]))
+                aim = growth.aim_at(askers, ground.pad(goal), ways.parent)
                 growth.begin(ground.pad(goal))
                 farthest, best = 0.0, naive.cost_to_go(pace, goal, **rules).reshape(-1)
             elif rng.random() < 0.3:  # a tree that was put down goes on like one in hand
                 growth.resume(growth.cut(), np.inf)
-            growth.go_on(np.array([ground.pad(asker)]), most, aim)
-            aimed += aim is not NO_AIM
+            askers = np.array([ground.pad(asker)]) if askers is None else askers
+            growth.go_on(askers, most, aim)
+            aimed += growth.bound == 0
             cost = costs_of(growth, pace)
             has = np.isfinite(cost)
             assert has.sum() == growth.touched
             np.testing.assert_allclose(cost[has], best[has], rtol=ROUNDING)
             left = ~has & np.isfinite(pace.reshape(-1))
             assert (best[left] >= growth.bound * (1 - ROUNDING)).all()
-            assert has[asker] or most < 1 << 40 or best[asker] == np.inf
+            cells = np.flatnonzero(np.isin(ground.pad_all(np.arange(pace.size)), askers))
+            assert has[cells].all() or most < 1 << 40 or np.isinf(best[cells]).any()
             # It goes no farther than the bucket of the farthest asker.
-            farthest = max(farthest, best[asker])
+            farthest = max(farthest, best[cells].max())
             if 0 < growth.bound < np.inf:
                 assert growth.bound <= farthest * (1 + ROUNDING) + ground.lowest_cell_cost
                 assert (cost[has] <= growth.bound * (1 + ROUNDING)).all()
@@ -76,6 +84,21 @@ def test_a_growth_that_stops_is_exact_where_it_was_and_bounds_the_rest(rules: di
         growth.go_on(everywhere, 1 << 40)
         np.testing.assert_allclose(costs_of(growth, pace), best, rtol=ROUNDING)
     assert aimed > 20
+
+
+def test_a_growth_aims_at_what_the_route_to_the_last_root_costs_to_the_new_one() -> None:
+    pace = (1.0 + 0.05 * np.random.default_rng(5).random((64, 64))).astype(np.float32)
+    ground, touched = loaded(pace, **RULES[0]), []
+    ways, asker, root = CostToGoTree(ground), np.array([ground.pad(32 * 64 + 50)]), 32 * 64 + 10
+    ways.grow(root)
+    for parent in (np.empty(0, np.uint8), ways.parent):
+        growth = PartialGrowth(ground)
+        for goal, aimed in ((root, False), (root + 1, True)):
+            aim = growth.aim_at(asker, ground.pad(goal), parent) if aimed else NO_AIM
+            growth.begin(ground.pad(goal))
+            growth.go_on(asker, 1 << 40, aim)
+        touched.append(growth.touched)
+    assert touched[1] < 0.75 * touched[0]
 
 
 @pytest.mark.parametrize("kind", ["narrow", "wide", "directed"])

@@ -50,7 +50,7 @@ def test_buckets_and_wide_buckets_give_the_same_costs_to_the_last_bit(rules: dic
         root, width = ground.pad(target), 0.98 * ground.lowest_cell_cost
         narrow, wide = np.empty(ground.size, np.float32), np.empty(ground.size, np.float32)
         scratch = queue_dial.make_scratch(ground.size, ground.rule, 4096)
-        state, at_once = np.empty(4, np.int64), (np.array((root,)), queue_dial.WHOLE, queue_dial.NO_AIM)
+        state, at_once = np.empty(5, np.int64), (np.array((root,)), queue_dial.WHOLE, queue_dial.NO_AIM)
         assert queue_dial.grow_by_buckets(ground.padded, narrow, (width, 4096), scratch, state, *at_once) > 0
         room = queue_wide_buckets.make_scratch(ground.size, ground.rule)
         reach = queue_wide_buckets.grow_by_wide_buckets(ground.padded, wide, root, width, room)

@@ -320,5 +320,7 @@ def test_a_raster_with_a_name_inside_that_is_no_text_is_refused_in_one_line(tmp_
     content[326], content[342] = 1, 128  # in the name of its coordinate system
     path = tmp_path / "a.tif"
     path.write_bytes(content)
-    with pytest.raises(SwarmError, match=r"^terrain .*a\.tif is truncated or no raster: 'utf-8' codec"):
+    with pytest.raises(
+        SwarmError, match=r"^terrain .*a\.tif: its name, or a name in it or in its \.prj, is not UTF-8"
+    ):
         _read(path)

@@ -124,6 +124,6 @@ def test_invented_tokens_start_few_questions_and_delay_no_known_process(roles: t
 
 def test_a_payload_beyond_the_limit_of_its_topic_is_rejected_unread(swarm: Measured) -> None:
     for topic in TOPICS:
-        check_size(bytes(topic.put_bytes), topic.put_bytes)
+        check_size(topic.put_bytes, topic.put_bytes)
         with pytest.raises(ProtocolError, match="bytes, at most"):
-            check_size(bytes(topic.put_bytes + 1), topic.put_bytes)
+            check_size(topic.put_bytes + 1, topic.put_bytes)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import os
 import signal
@@ -30,6 +31,7 @@ from docs.generate.wire_page import JSON_PATH as WIRE_PAGE
 from docs.generate.wire_page import example, key_fields, put_from_outside
 from launch_scripts.ports import free_ports
 from swarm.bus.bus import Appeared, Asked, AskEnded, Disappeared, Heard, LinkChanged, Replied, meant_for
+from swarm.bus.endpoints import host_port
 from swarm.bus.zenoh_bus import ZenohBus, open_bus
 from swarm.clock import MonotonicClock
 from swarm.config.scenario import NetworkConfig
@@ -419,7 +421,19 @@ def test_a_question_longer_than_its_topic_allows_is_refused_before_it_waits(worl
     ):  # without a router between
         [reply] = bus.session.get(key, payload=bytes(topic.ask_bytes + 1), timeout=5.0)
         assert f"payload of {topic.ask_bytes + 1:,} bytes" in reply.err.payload.to_string()
+        [reply] = bus.session.get(f"{key}?" + "a=1;" * (topic.ask_bytes // 4 + 1), timeout=5.0)
+        assert "payload of" in reply.err.payload.to_string()
     assert waiting == []
+
+
+def test_a_hundred_links_that_begin_with_nonsense_keep_nobody_from_joining(world, router: Router) -> None:
+    place = host_port(router.endpoint)
+    with contextlib.ExitStack() as links:
+        for _ in range(100):
+            links.enter_context(socket.create_connection(place, timeout=5.0)).sendall(b"\x20\x00" + bytes(32))
+        began_s = time.monotonic()
+        world.bus("joins")
+        assert time.monotonic() - began_s < 2.0
 
 
 class Deaf(Idle):

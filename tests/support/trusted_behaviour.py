@@ -5,13 +5,16 @@ A world's `bus` takes an `authenticator`.
 
 from __future__ import annotations
 
+import pytest
 from support.bus_world import Box, answering, asked, decoded, marks
+from support.makers import cost_reply
 
 from swarm.bus.bus import Asked, AskEnded, Replied
 from swarm.wire.access import Authenticator
 from swarm.wire.messages.map_data import MarksRequest
+from swarm.wire.messages.planning import CostRequest
 from swarm.wire.messages.traffic import Claim, Stored, Table
-from swarm.wire.topics import MARKS, STORED, TABLE
+from swarm.wire.topics import COST, MARKS, STORED, TABLE, rank_of
 
 OURS = Authenticator(b"secret", "run")
 OTHERS = (None, Authenticator(b"another secret", "run"), Authenticator(b"secret", "another run"))
@@ -82,3 +85,20 @@ def test_a_question_without_the_secret_is_refused(world):
     box = asked(world, ours, TABLE, Claim(epoch=3), shard=0, member="a1", agent="a0")
     assert [event.request.epoch for event in served.of(Asked)] == [3]
     assert len(box.of(Replied)) == 1
+
+
+@pytest.mark.parametrize(("asker", "rank"), [("agent.a0", 0), ("operator.o", 1)])
+def test_an_asker_has_the_turn_of_a_name_only_with_a_code(world, asker: str, rank: int):
+    served = Box()
+
+    def post(event):
+        served.append(event)
+        answering((cost_reply([1.0], target="t0"), {"target": "t0"}))(event)
+
+    world.bus("serves", authenticator=OURS).serve(COST, decoded(post), target="t0")
+    world.settle()
+    for authenticator, expected in ((OURS, rank), (OTHERS[1], 2), (None, 2)):
+        bus = world.bus(f"asks{expected}", authenticator=authenticator)
+        box = asked(world, bus, COST, CostRequest(cells=[1]), target="t0", asker=asker)
+        assert rank_of(served[-1].asker) == expected
+    assert [event.fields["asker"] for event in box.of(Replied)] == [asker]  # a stranger is answered, too

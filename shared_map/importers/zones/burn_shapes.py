@@ -99,7 +99,7 @@ class Placing:
         """Raises TerrainError if the layer holds no feature, or none that was placed is on the terrain."""
         what = self._layer.what
         if np.isnan(self._reach).any():
-            raise TerrainError(f"{what} holds no feature")
+            raise TerrainError(f"{what} holds no feature or fence")
         if not self._touched:
             hint = "are x and y in reverse?" if self._reversed(self._reach[None])[0] else "is crs right?"
             raise TerrainError(

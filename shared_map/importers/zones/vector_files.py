@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from pyogrio.raw import read
 
 from shared_map.importers.georeference import system_named
-from shared_map.importers.raster_files import DRAWINGS, beginning, faults_of, number_of, other_format
+from shared_map.importers.raster_files import DRAWINGS, beginning, faults_of, is_raster, number_of, other_format
 from shared_map.importers.zones.zone_files import IN_ARCHIVES, Kind, kind_of
 from swarm.config.explain import nearest
 from swarm.config.input_files import FileKind, check_bytes, read_bytes, size
@@ -57,7 +57,7 @@ class Layer:
     index    its number in the file
     crs      as the file has it; empty if it has none
     columns  names of its attributes
-    count    features which the file says that it holds
+    count    features which the file says that it holds; -1 if it does not
     """
 
     source: str | bytes
@@ -129,8 +129,9 @@ def open_layers(path: Path, layer: str | None, what: str) -> list[Layer]:
                     found_is = f"is a {held[0]}, expected a table; ogr2ogr makes a copy of it"
                     raise TerrainError(f"{what}: layer {name!r} {found_is}")
             index = listed[:, 0].tolist().index(name)
-            info = pyogrio.read_info(source, layer=index, force_feature_count=True)
-            count = max(int(info["features"]), least)  # GDAL believes the header of the index
+            # Those of an OSM are known after all of it has been read.
+            info = pyogrio.read_info(source, layer=index, force_feature_count=kind.driver != "OSM")
+            count = -1 if kind.driver == "OSM" else max(int(info["features"]), least)  # the index may say less
             columns = tuple(str(field) for field in info["fields"])
             found.append(Layer(source, what, index, name, str(info["crs"] or ""), columns, count))
         return found
@@ -164,7 +165,7 @@ def read_features(layer: Layer, columns: Sequence[str]) -> Iterator[Features]:
             raise unusable(layer.what, features.id(n), why)
         yield features
         if len(numbers) < _CHUNK:
-            if (count := first + len(numbers)) != layer.count:
+            if (count := first + len(numbers)) != layer.count >= 0:
                 raise TerrainError(f"{layer.what} is damaged: of its {layer.count} features {count} are read")
             return
 
@@ -201,6 +202,8 @@ def _source(path: Path, what: str) -> tuple[str | bytes, Kind]:
     if kind is None:
         if path.suffix.lower() in (".dbf", ".shx", ".prj"):
             raise TerrainError(f"{what} is a part of a Shapefile; name the .shp beside it")
+        if is_raster(path):
+            raise TerrainError(f"{what} is read as a raster, which goes with kind pace or factor of a scenario")
         neither = f"is neither {DRAWINGS['names']}, nor a .zip of one"
         raise TerrainError(f"{what} {other_format(head, neither)}")
     absolute = path.resolve()
@@ -351,7 +354,7 @@ def checked_json(data: bytes, kind: Kind, what: str, name: str) -> bytes:
             discs = [_disc(each.circle.center, each.circle.radius, each.inclusion) for each in fence.circles]
             return _collection([*areas, *discs], name)
         if document.type == "FeatureCollection" and not document.features:
-            raise TerrainError(f"{what} holds no feature")
+            raise TerrainError(f"{what} holds no feature or fence")
         if document.crs is not None:
             document.crs.check(f"{what}: its crs")
         features = []
@@ -390,6 +393,8 @@ def checked_xml(data: bytes, what: str) -> None:
     try:
         for _, element in ElementTree.iterparse(io.BytesIO(data)):
             name = element.tag.rpartition("}")[2]
+            if name in ("nd", "member", "tag"):  # of which the element around them is asked
+                continue
             places: list[list[str]] = []
             if name == "coordinates":
                 # A match begins at the first blank of a run only: the time grows with the text, not its square.
@@ -430,8 +435,7 @@ def checked_xml(data: bytes, what: str) -> None:
                     open_areas.add(id)
             elif is_area:
                 rings[id] = refs
-            if name not in ("nd", "member", "tag"):
-                element.clear()
+            element.clear()
     except ElementTree.ParseError as error:
         raise TerrainError(f"{what} is damaged: {error}") from error
     for area in open_areas.difference(*rings.values()):  # GDAL makes lines of them

@@ -43,6 +43,7 @@ class Way:
 _TABLES = tomllib.loads((Path(__file__).parent / "ways.toml").read_text(encoding="utf-8"))
 _EXTENTS: Mapping[str, Sequence[float]] = _TABLES.pop("extents")
 """Columns for the extent of points and lines, in any letter case -> (width / value, largest width in metres)."""
+_UNCLEAR: Mapping[str, Sequence[str]] = _TABLES.pop("unclear")
 COLUMNS: Mapping[Kind, Sequence[str]] = _TABLES.pop("columns")
 """Columns of the class, by the kind of zone."""
 
@@ -97,18 +98,23 @@ def way_of(kind: Kind | None, name: str, own: Mapping[str, WayConfig]) -> Way | 
     return Way(width_m, None if given.factor == "lethal" else given.factor)
 
 
-def states_extent(column: str) -> bool:
-    """Returns True if a column states how far a point or a line reaches, in a unit that is read or not."""
-    name = column.lower()
-    return name in _EXTENTS or any(word in name for word in ("radius", "diameter", "buffer"))
+def states_extent(column: str, of_point: str = "") -> bool:
+    """Returns True if a column states how far a point or a line reaches, in a unit that is read or not.
+
+    of_point  what the column holds for a point, of which any number in it may be the reach
+    """
+    name, is_number = column.lower(), of_point.strip(" 0.,+-")[:1].isdigit()
+    words = re.split(r"[\W\d_]+|(?<=[a-z])(?=[A-Z])", column) if is_number else ()
+    may = any(word.lower() in _UNCLEAR["of_points"] for word in words)
+    return may or name in _EXTENTS or any(word in name for word in _UNCLEAR["anywhere"])
 
 
-def width_of(tags: Mapping[str, str]) -> float | None:
+def width_of(tags: Mapping[str, str], *, is_point: bool = False) -> float | None:
     """The width in metres that a feature has of its own; of "2-4 m" the larger.
 
     Raises ValueError, which names the column, if it states an extent that cannot be read.
     """
-    stated = {key.lower(): value for key, value in tags.items() if states_extent(key)}
+    stated = {key.lower(): value for key, value in tags.items() if states_extent(key, value * is_point)}
     for key in sorted(stated, key=lambda key: [*_EXTENTS, key].index(key)):
         lengths = [_LENGTH.fullmatch(part) for part in re.split("[;-]", stated[key])]
         found = [float(each[1].replace(",", ".")) * _UNITS_M.get(each[2], 1.0) for each in lengths if each]
@@ -208,7 +214,8 @@ class _Worth:
         has_classes = name is not None or not {*assumed, *PACKED}.isdisjoint(layer.columns)
         self._by_class = bool(zone.classes) or (self._kind is not None and has_classes)
         key = "factor" if zone.kind == "factor" else "pace_s_per_m"
-        self.columns = [*TAGS, *PACKED, *assumed, *filter(states_extent, layer.columns), *([name] if name else ())]
+        extents = [column for column in layer.columns if states_extent(column, "1")]
+        self.columns = [*TAGS, *PACKED, *assumed, *extents, *([name] if name else ())]
         for is_wrong, why in (
             (name is not None and {name, *PACKED}.isdisjoint(layer.columns), f"has no column {name!r}"),
             (zone.classes and zone.kind == "pace", "has classes with factors, which kind pace does not take"),
@@ -234,20 +241,18 @@ class _Worth:
         drawing, used = self._drawing, set()
         if self._closes:
             drawing.keeps |= bool((features.columns.get(INCLUSION, np.zeros(0, object)) == "yes").any())
-        ways: dict[tuple[int, bool], tuple[Way | None, bool, bool]] = {}
+        ways: dict[tuple[int, str], tuple[Way | None, bool, bool]] = {}
         for shape, n in zip(shapes, of.tolist(), strict=True):
-            is_area = shape.geom_type == "Polygon"
-            if (n, is_area) not in ways:
+            is_area, key = shape.geom_type == "Polygon", (n, shape.geom_type)
+            if key not in ways:
                 tags = unpacked(features.tags(n))
-                if is_area:  # it has its own extent
-                    tags = {name: value for name, value in tags.items() if not states_extent(name)}
-                way = self._way(tags, features.id(n))
+                way = self._way(tags, features.id(n), shape.geom_type)
                 over = tags.get("bridge", "no").lower() not in _NOT_A_BRIDGE
                 bridge = way is not None and self._kind == "road" and over
                 self._facts.bridges += bridge
                 inclusion = tags.get(INCLUSION, "yes" if self._zone.kind == "keep_in" else "no").lower()
-                ways[n, is_area] = way, bridge, self._closes and inclusion in ("yes", "true", "1")
-            way, bridge, inside = ways[n, is_area]
+                ways[key] = way, bridge, self._closes and inclusion in ("yes", "true", "1")
+            way, bridge, inside = ways[key]
             if way is None:
                 continue
             if inside and not way.width_m and not is_area:
@@ -261,7 +266,7 @@ class _Worth:
                 drawing.bridges.append(drawn)
         self._facts.used += len(used)
 
-    def _way(self, tags: dict[str, str], id: str) -> Way | None:
+    def _way(self, tags: dict[str, str], id: str, geometry: str) -> Way | None:
         """Width and factor of a feature; None if it is left out, which the facts then tell."""
         zone, kind = self._zone, self._kind
         name = class_of(kind, tags, zone.attribute) if self._by_class else ""
@@ -283,7 +288,9 @@ class _Worth:
             return None
         closes = self._closes or (kind == "water" and not name)
         try:
-            own_m = width_of(tags)
+            # An area has its own extent.
+            is_point = geometry == "Point" and zone.width_m is None
+            own_m = None if geometry == "Polygon" else width_of(tags, is_point=is_point)
         except ValueError as error:
             if closes or kind == "water":
                 raise unusable(self._layer.what, id, str(error)) from None
@@ -329,7 +336,7 @@ def outlines_of(zone: ZoneConfig, grid: GridSpec, most_corners: int) -> list[lis
         A scenario's zone would be refused with the same file, or an area has more than `most_corners` corners, or
         there are too many areas.
     """
-    what = f"zone {zone.file}"
+    what = f"zone {Path(zone.file or '')}"
     return _outlines(draw_zone(zone, grid, what), grid, what, most_corners)
 
 

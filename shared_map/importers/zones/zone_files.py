@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import re
 from collections import Counter
 from collections.abc import Sequence
@@ -14,9 +13,8 @@ import numpy as np
 
 from shared_map.array_files import Bools, Floats
 from shared_map.importers.georeference import crs_name, place_on
-from shared_map.importers.raster_files import DRAWINGS, beginning, is_raster, opened
+from shared_map.importers.raster_files import DRAWINGS, is_raster, opened
 from swarm.config.ground import ZoneConfig
-from swarm.config.input_files import FileKind
 from swarm.errors import TerrainError
 from swarm.grid import GridSpec, Window
 
@@ -38,13 +36,6 @@ def kind_of(head: bytes) -> Kind | None:
     text = head.removeprefix(b"\xef\xbb\xbf").lstrip().decode("latin-1")
     rows = ((begins.replace("BEFORE_ROOT", _BEFORE_ROOT), row) for begins, row in DRAWINGS["begins"].items())
     return next((Kind(*row) for begins, row in rows if re.match(begins, text, re.DOTALL)), None)
-
-
-def is_vector(path: Path) -> bool:
-    """Returns True if a file begins, or a .zip is, as one that holds features. False if it cannot be opened."""
-    with contextlib.suppress(OSError, TerrainError):
-        return kind_of(beginning(path, IN_ARCHIVES, FileKind.VECTORS, "")[0]) is not None
-    return False
 
 
 _NAMED = 5
@@ -99,7 +90,7 @@ def burn_zone(zone: ZoneConfig, grid: GridSpec, where: str) -> Burnt:
     """The cells of a zone that a file draws. Raises TerrainError with one sentence, which `where` begins."""
     path = Path(zone.file or "")
     what = f"{where} {path}"
-    if not is_vector(path) and is_raster(path):
+    if zone.kind in ("pace", "factor") and is_raster(path):
         return _friction(zone, path, grid, where)
     from shared_map.importers.zones.burn_shapes import burn
     from shared_map.importers.zones.zone_features import closed_shapes, draw_zone
@@ -114,8 +105,6 @@ def burn_zone(zone: ZoneConfig, grid: GridSpec, where: str) -> Burnt:
 def _friction(zone: ZoneConfig, path: Path, grid: GridSpec, where: str) -> Burnt:
     """A raster of paces or factors. Infinite is lethal; where there is no value the ground is left as it is."""
     what = f"{where} {path}"
-    if zone.kind not in ("pace", "factor"):
-        raise TerrainError(f"{what} is read as a raster, which goes with kind pace or factor, found {zone.kind!r}")
     given = [key for key in ("layer", "attribute", "width_m", "classes", "value") if getattr(zone, key)]
     if given:
         raise TerrainError(f"{what} is a raster, which has no {given[0]}")

@@ -442,6 +442,16 @@ def test_routes_take_no_more_memory_than_is_counted_for_them(recorder: Recorder)
     assert took < 1.2 * recorder.routes._total
 
 
+def test_tracks_take_no_more_memory_than_is_counted_for_them(recorder: Recorder) -> None:
+    keys, tracks = tuple((f"t{n}", 0) for n in range(4)), recorder.target_tracks
+    tracemalloc.start()
+    for at_ns in range(10**18, 10**18 + 5000):
+        tracks.add(Sampling(at_ns, keys, np.zeros((4, 2), np.float32)))
+    took, _ = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert took < 1.2 * 8 * tracks._total  # a place is two floats of 4 bytes
+
+
 def told(kind: str, about: str, since_s: float, over_s: float | None = None) -> Alarm:
     over_ns = None if over_s is None else int(over_s * NS_PER_S)
     return Alarm(

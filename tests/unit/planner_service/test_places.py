@@ -264,6 +264,21 @@ def test_a_far_question_keeps_its_turn_from_all_but_nearer_ones_and_those_of_age
     assert len(turns) == len(begun) + 1, "only the first had to let others pass"
 
 
+@pytest.mark.parametrize("kind", ["agent", "rover"])
+def test_near_goals_without_end_leave_a_turn_to_a_far_question_of_the_same_kind(monkeypatch, kind: str) -> None:
+    monkeypatch.setattr(places, "SLICE_CELLS", 200)
+    monkeypatch.setattr(places, "_CELL_NS", 5000)  # 1 ms a slice
+    world = PlacesWorld(flat())
+    heard = world.ask(GRID.cell(2, 2), GRID.cell(30, COLS - 2), asker=f"{kind}.far")
+    flood = [[]]
+    for _ in range(50):
+        near = GRID.cell(20, 20), GRID.cell(20, 22)
+        flood = [each for each in flood if not each] + [world.ask(*near, asker=f"{kind}.near") for _ in range(20)]
+        world.run(0.01)
+    assert len(flood) > 100, "the process is not idle"
+    assert heard[0].message.status == "ok"
+
+
 def test_ten_thousand_goals_of_a_stranger_leave_memory_bounded_and_agents_first(monkeypatch):
     monkeypatch.setattr(places.settings, "PLACE_TREES_BYTES", 100_000)
     world = PlacesWorld(flat())
@@ -281,7 +296,7 @@ def test_ten_thousand_goals_of_a_stranger_leave_memory_bounded_and_agents_first(
     assert any("too many questions wait here" in str(failure) for failure in refused)
     trees = world.service._classes["ground"].trees
     assert trees.bytes <= 100_000
-    assert len(world.service._waiting) <= 4096
+    assert len(world.service._near) + len(world.service._far) <= 4096
 
 
 def test_each_group_asks_a_process_that_knows_what_the_group_may_know() -> None:

@@ -8,7 +8,7 @@ from support import slow_twins as naive
 from support.kernel_oracle import loaded
 from support.planner_swarm import Planners
 
-from planner_service.target_search import Ways
+from planner_service.target_search import Ways, hidden_target
 from shared_map.terrain.terrain import build_terrain
 from swarm.clock import NS_PER_S
 from swarm.config.scenario_files import parse_scenario
@@ -50,6 +50,18 @@ class World(Planners):
         """The answer for a vehicle."""
         request = RouteRequest(cells=[cell], vehicles=[vehicle], vehicle_class=vehicle_class)
         return next(iter(self.ear.answer(ROUTE, request, target="h").routes))
+
+
+@pytest.mark.parametrize(
+    ("speed_m_per_s", "slowness"), [(0.0, math.inf), (2.0, 3.0), (6.0, 1.0), (12.0, 1.0)], ids=str
+)
+def test_a_target_is_searched_for_at_its_own_pace_and_never_as_quicker_than_vehicles(
+    speed_m_per_s: float, slowness: float
+) -> None:
+    target = f'targets = [{{ name = "h", tracker = "sighted", speed_m_per_s = {speed_m_per_s} }}]'
+    scenario = parse_scenario(f"cost = {{ flat_speed_m_per_s = 6.0 }}\n{target}")
+    assert hidden_target(scenario, "h", 1).slowness == slowness
+    assert hidden_target(scenario, "added", 1).slowness == 1.0
 
 
 def test_vehicles_of_different_classes_search_by_one_belief_each_on_its_own_ground_and_apart() -> None:

@@ -12,7 +12,13 @@ from support.planner_play import Play
 from support.planner_strategies import Job, Marks, Move, random_pace
 
 from planner_service import strategy as strategies
-from planner_service.growth_times import MODEL_EXACT_NS_PER_CELL, MODEL_NEAR_NS_PER_CELL, NEAR_CELLS, GrowthTimes
+from planner_service.growth_times import (
+    MODEL_EXACT_NS_PER_CELL,
+    MODEL_NEAR_NS_PER_CELL,
+    NEAR_CELLS,
+    TRIED_AFTER,
+    GrowthTimes,
+)
 from planner_service.target_tree import TargetTree
 from planner_service.tree import partitioned_tree
 from swarm.config.plugin_names import PLUGIN_KINDS, NamedPlugin
@@ -205,6 +211,40 @@ def test_auto_takes_the_cheaper_of_a_growth_to_the_askers_and_an_exact_move_and_
                 whole = taken[-1] == "exact"
             assert sum(before != after for before, after in itertools.pairwise(taken)) <= 2, taken
             assert costs_ns[taken[-1]] <= 1.25 / strategies.HYSTERESIS * min(costs_ns.values())
+
+
+@pytest.mark.parametrize(
+    ("better", "near", "took_ns"), [("exact", 170_000, 2_400_000), ("bounded", 10_000, 100_000)]
+)
+def test_auto_returns_to_the_better_way_to_follow_a_target_after_it_was_slow_on_a_busy_machine(
+    better: str, near: int, took_ns: int
+) -> None:
+    times = GrowthTimes(GridSpec(512, 512, 10.0), PlannerConfig(cpu_budget=1.0), False, False, None)
+    costs_ns = {"exact": times.exact_ns, "bounded": took_ns}
+    times.note_near(near)
+    for _ in range(5):
+        times.observe(better, 20 * costs_ns[better])
+    taken = []
+    for _ in range(2 * TRIED_AFTER):
+        taken.append("bounded" if times.stops(is_whole=taken[-1:] == ["exact"]) else "exact")
+        times.observe(taken[-1], costs_ns[taken[-1]])
+    assert taken[0] != better
+    assert taken[-1] == better
+    assert sum(before != after for before, after in itertools.pairwise(taken)) == 1
+
+
+def test_growths_that_are_quick_again_tell_that_those_which_stop_are_too() -> None:
+    times = GrowthTimes(GridSpec(4096, 4096, 10.0), PlannerConfig(cpu_budget=0.1), True, False, None)
+    times.note_near(40_000)
+    times.observe_full_ns(3_000_000_000)
+    for kind in ["exact", "bounded"] * 5:
+        times.observe(kind, 70_000_000)
+    times.note_near(40_000)
+    assert times.row.on_move is strategies.OnMove.SCHEDULED_WINDOW
+    for _ in range(5):
+        times.observe_full_ns(300_000_000)
+    assert times.near_ns < times.budget_ns
+    assert times.row.on_move is strategies.OnMove.EXACT_MOVE
 
 
 def large_tree(clock: Iterator[int] | None = None) -> tuple[TargetTree, np.ndarray, GridSpec]:

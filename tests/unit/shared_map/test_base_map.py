@@ -1,8 +1,10 @@
 """The base map: pieces in any order make the same terrain, and no false piece is taken."""
 
 import contextlib
+import threading
 import zlib
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import msgspec
@@ -19,7 +21,7 @@ from shared_map.keeper.base_map import LAYERS, NEEDED, BaseMapCopy, BaseMapServe
 from shared_map.keeper.mark_store import KeeperStore
 from shared_map.terrain.store import load_prepared
 from shared_map.terrain.terrain import Terrain, build_terrain
-from swarm.bus.bus import Event, Replied
+from swarm.bus.bus import Event, Post, Replied, Undecoded
 from swarm.config.ground import CostConfig, TerrainConfig, ZoneConfig
 from swarm.config.scenario import GroupConfig, Scenario
 from swarm.errors import ProtocolError, TerrainError
@@ -224,6 +226,22 @@ def test_every_keeper_answers_for_its_terrain() -> None:
     swarm.run(3)
     found = [event.message for event in events if isinstance(event, Replied)]
     assert sorted(each.keeper for each in found if isinstance(each, BaseMap)) == ["k1", "k2"]
+
+
+def test_the_thread_that_answers_ends_with_the_service():
+    """One that returned from Zenoh after the interpreter had ended would abort the process."""
+    before, posts = set(threading.enumerate()), list[Post]()
+    server = BaseMapServer(TERRAIN, "0")
+    bus: Any = SimpleNamespace(serve=lambda topic, post, **fields: posts.append(post))
+    server.start(bus)
+    server.stop()  # it has no thread yet
+    server = BaseMapServer(TERRAIN, "0")
+    server.start(bus)
+    answerer: Any = SimpleNamespace(timeout_s=60.0, size=0, waited_s=lambda: 0.0)
+    posts[-1](Undecoded(BASE_MAP, answerer, lambda: None))
+    [thread] = set(threading.enumerate()) - before
+    server.stop()
+    assert not thread.is_alive()
 
 
 def test_a_fetched_terrain_which_the_disk_has_changed_is_fetched_again(tmp_path, monkeypatch):

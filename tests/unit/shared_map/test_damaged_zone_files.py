@@ -357,8 +357,9 @@ def test_a_stated_extent_is_closed_up_to_its_edge(tmp_path: Path, tags: dict[str
 
 @pytest.mark.parametrize(
     "tags",
-    [{"radius": "wide"}, {"radius_nm": 3}, {"Radius": -5}, {"width": 20_000}, {"radius": [1, 2]}, {"buffer_m": 50}],
-)
+    [{"radius": "wide"}, {"radius_nm": 3}, {"Radius": -5}, {"width": 20_000}, {"radius": [1, 2]}, {"buffer_m": 50},
+        {"range": 80}, {"Dist": 80.0}, {"safetyDistance": "80 m"}, {"RANGE_M": 8}, {"BUFF_DIST": 8}, {"rayon": 80}],
+)  # fmt: skip
 def test_an_extent_that_cannot_be_read_is_refused_by_name(tmp_path: Path, tags: dict[str, Any]) -> None:
     file = geojson(tmp_path / "a.geojson", [feature(shapely.Point(15.5, 14.5), **tags)])
     words = (
@@ -366,6 +367,32 @@ def test_an_extent_that_cannot_be_read_is_refused_by_name(tmp_path: Path, tags: 
     )
     with pytest.raises(TerrainError, match=words):
         painted([ZoneConfig(kind="forbidden", file=file)])
+
+
+@pytest.mark.parametrize("tags", [{"range": 80}, {"distance": "far"}, {"dist": 0}, {"orange": 80}])
+def test_another_number_of_a_line_or_of_a_point_with_a_width_is_no_extent(tmp_path: Path, tags: dict) -> None:
+    line = geojson(tmp_path / "line.geojson", [feature(shapely.LineString([(5, 9.5), (25, 9.5)]), **tags)])
+    pace, _ = painted([ZoneConfig(kind="forbidden", file=line)])
+    assert (pace != np.float32(0.1)).sum() < 30
+    point = geojson(tmp_path / "point.geojson", [feature(shapely.Point(15.5, 14.5), **tags)])
+    assert closed_by(point, "forbidden").sum() == 1
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "words"),
+    [
+        ("a.csv", 'id,WKT\n1,"POLYGON ((9 47, 9.1 47, 9 47.1, 9 47))"\n', r"shapes as text \(WKT\)"),
+        ("a.kml", '<!DOCTYPE kml [<!ENTITY a "b">]><kml><Document/></kml>', "an XML with entities of its own"),
+        ("a.plan", plan([]), "holds no feature or fence"),
+        ("a.asc", "ncols 1\nnrows 1\nxllcorner 0\nyllcorner 0\ncellsize 1\n1\n", "is read as a raster, which goes"),
+    ],
+)
+def test_both_doors_say_what_a_file_is(tmp_path: Path, name: str, text: str, words: str) -> None:
+    (tmp_path / name).write_text(text)
+    zone = ZoneConfig(kind="forbidden", file=str(tmp_path / name))
+    for door in (lambda: painted([zone]), lambda: outlines_of(zone, UTM, 256)):
+        with pytest.raises(TerrainError, match=words):
+            door()
 
 
 def test_a_fence_keeps_in_and_keeps_out(tmp_path: Path) -> None:

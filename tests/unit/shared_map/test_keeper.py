@@ -70,6 +70,21 @@ def test_a_batch_is_what_one_commit_should_hold() -> None:
     assert max(map(len, batches)) < 60
 
 
+def test_of_two_keepers_on_one_store_whose_lock_was_deleted_one_ends_and_no_set_is_lost(tmp_path: Path) -> None:
+    path, sets = tmp_path / "map.sqlite", some_sets()
+    with KeeperStore(path) as first:
+        first.bind("t", GRID)
+        (tmp_path / "map.sqlite.lock").unlink()
+        with KeeperStore(path) as second:
+            first.save(sets[:1])
+            for _ in range(2):
+                with pytest.raises(DamagedError, match="was written by another keeper"):
+                    second.save(sets[1:])
+            first.save(sets[2:])
+    with KeeperStore(path) as store:
+        assert list(store.load()) == [sets[0], *sets[2:]]
+
+
 def test_the_store_of_another_terrain_is_refused(tmp_path: Path) -> None:
     store = KeeperStore(tmp_path / "map.sqlite")
     store.bind("0123456789abcdef", GRID)

@@ -119,7 +119,7 @@ def test_a_raster_gives_paces_or_factors_and_leaves_the_rest(tmp_path: Path) -> 
             raster(tmp_path / "d.tif", values, from_origin(0, 0, 10.0, 10.0), UTM.crs),
             "covers x 0..250, y -200",
         ),
-        ("road", file, "is read as a raster, which goes with kind pace or factor, found 'road'"),
+        ("road", file, "is read as a raster, which goes with kind pace or factor of a scenario"),
         (
             "factor",
             raster(nowhere, values, place, None),

@@ -25,7 +25,7 @@ from shared_map.terrain.true_ground import build_truth
 from swarm.config.ground import CostConfig, TerrainConfig, ZoneConfig
 from swarm.config.scenario import Scenario
 from swarm.config.scenario_files import load_scenario
-from swarm.errors import StoreError, TerrainError
+from swarm.errors import ConfigError, StoreError, TerrainError
 from swarm.runtime.role_setup import RoleSetup
 
 SCENARIOS = Path(__file__).parents[3] / "launch_scripts" / "scenarios"
@@ -230,3 +230,23 @@ def test_a_mark_on_one_cell_is_seen_from_afar() -> None:
     marks[4, 6] = True
     assert any_in_blocks(marks, 1) is marks
     assert any_in_blocks(marks, 4).tolist() == [[False, False], [False, True]]
+
+
+WRONG = (object(), b"x", [[1, 2], [3]], np.datetime64("2020"), np.array([[1.5]]), 10**400, 1j)
+SETTINGS = [(TerrainConfig, "terrain", name) for name in TerrainConfig.__struct_fields__ if name != "source"]
+SETTINGS += [(CostConfig, "cost", name) for name in CostConfig.__struct_fields__]
+
+
+@pytest.mark.parametrize(("section", "key", "name"), SETTINGS)
+@pytest.mark.parametrize("value", WRONG, ids=[type(value).__name__ for value in WRONG])
+def test_a_setting_from_python_is_what_a_file_may_have_or_is_refused_by_name(section, key, name, value):
+    with pytest.raises(ConfigError, match=rf"^the scenario: ({key}\.{name}|a value of it)"):
+        build_terrain(msgspec.structs.replace(SMALL, **{key: section(**{name: value})}))
+
+
+def test_settings_from_python_may_be_of_numpy_and_paths(tmp_path: Path) -> None:
+    file = written(tmp_path / "a.tif", np.arange(20.0).reshape(4, 5))
+    config = TerrainConfig(source=file, resolution_m=np.float32(10), nodata_values=np.array([3.0]))  # type: ignore[arg-type]
+    terrain = build_terrain(Scenario(terrain=config))
+    assert terrain.grid.shape == (8, 10)
+    assert terrain.lethal.any()

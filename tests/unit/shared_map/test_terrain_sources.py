@@ -275,10 +275,16 @@ BAD: list[tuple[Callable[[Path], dict[str, Any]], str]] = [
     (lambda f: blank(f, "a.zip", b"PK no"), r"damaged or no \.zip"),
     (lambda f: blank(f, "a.hgt", bytes(2 * 1201**2)), "says by its name where it lies, such as N46E008.hgt"),
     (lambda f: blank(f, "N46E010.hgt", bytes(1000)), r"truncated or no \.hgt: it has 1000 bytes"),
-    (lambda f: dem(f, heights() * np.float32(100)), "m: of centimetres set terrain.height_scale = 0.01"),
+    (
+        lambda f: dem(f, heights() * np.float32(100)),
+        r"less than 20 km: set terrain\.height_scale \(1; of centimetres",
+    ),
     (lambda f: dem(f, heights().astype(np.uint8), compress="jpeg"), "with loss, expected exact numbers"),
     (lambda f: dem(f, None, from_origin(9, 46, 0.001, 0.001)), "a cell of 0.001 looks like degrees"),
-    (lambda f: {"source": dem(f)["source"].rename(f / os.fsdecode(b"a\xff.tif"))}, "codec can't encode character"),
+    (
+        lambda f: {"source": dem(f)["source"].rename(f / os.fsdecode(b"a\xff.tif"))},
+        "its name, or a name in it .* is not UTF-8",
+    ),
     (lambda f: raw(f, 3), "has 100 bytes, expected 30, as the header beside it says"),
     (lambda f: raw(f, 11), "has 100 bytes, expected 110"),
     (two_variables, "several rasters .*height.*snow"),

@@ -2,7 +2,9 @@
 
 import math
 from itertools import product
+from typing import Any
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -124,3 +126,18 @@ def test_a_walk_goes_cell_by_cell_and_never_over_a_border(given_cell, codes):
     assert walk(grid, cell, bytes(codes)) == cells
     rows, cols = zip(*map(grid.row_col, cells), strict=True)
     assert bounds_of(cells, grid.cols) == (min(rows), min(cols), max(rows), max(cols))
+
+
+@pytest.mark.parametrize("half", [1.5, 2.0, np.float32(2.5), "2", None, True, np.nan])
+def test_a_cell_is_whole_numbers(half: Any) -> None:
+    grid = GridSpec(6, 7, 10.0)
+    for ask in (
+        lambda: grid.cell(half, 1),
+        lambda: grid.cell(1, half),
+        lambda: grid.row_col(half),
+        lambda: grid.centre_m(half),
+        lambda: GridSpec(half, 7, 10.0),
+    ):
+        with pytest.raises(TypeError):
+            ask()
+    assert grid.row_col(grid.cell(np.int64(2), np.uint8(3))) == (2, 3)

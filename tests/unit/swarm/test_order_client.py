@@ -55,6 +55,7 @@ def test_an_agent_waits_for_its_goals_too_and_answers_an_operator_once_it_has_th
     client.start(0)
     client.tick(NS_PER_S)
     assert [call.args[0].name for call in bus.ask.call_args_list] == ["goals", "orders"], "both are open"
+    assert [call.args[0] for call in bus.subscribe.call_args_list] == [ORDERS, GOALS]
     client.on_order_event(Heard(ORDERS, {}, Orders(role="keeper", id="0", orders=[PAUSE])), 1)
     assert not client.known
     order = Obey(subject="vehicle", name="a0-00", stamp_ns=5, goals=True)

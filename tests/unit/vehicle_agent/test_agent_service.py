@@ -5,6 +5,7 @@ import pytest
 from support.agent_world import OPEN, AgentWorld, pace_of, scenario
 
 from swarm.bus.bus import LinkChanged
+from swarm.clock import NS_PER_S
 from swarm.errors import ConfigError
 from swarm.wire.messages.processes import Stats
 from swarm.wire.messages.vehicles import Obstacle, VehicleState
@@ -66,6 +67,21 @@ def test_a_vehicle_that_an_obstacle_shuts_in_raises_an_alarm_until_the_obstacle_
     assert not world.agents["a0"].agent.obstacles.is_deaf, "tokens of routers, which anybody may raise, stop nobody"
     world.until(lambda: alarms() == [("a0-00", 10, False)])
     assert world.count("shut_in") == 1
+
+
+def test_a_vehicle_that_drives_between_two_ticks_avoids_an_obstacle_that_has_come_meanwhile() -> None:
+    world = AgentWorld(scenario(1, [(1, 1)]), pace_of(["#" * 20, f"#{'.' * 18}#", "#" * 20])).begin(t=(1, 18))
+    service = world.agents["a0"]
+    world.until(lambda: len(service.agent.holdings.path("a0-00")) > 4, within_s=10)
+    cell = service.agent.holdings.path("a0-00")[1]
+    x_m, y_m = world.terrain.grid.centre_m(cell)
+    obstacle = Obstacle(id="p", incarnation=1, seq=1, x_m=x_m, y_m=y_m, radius_m=1.0, lease_s=10.0)
+    world.bus("person").publish(OBSTACLE, obstacle, id="p")
+    world.run(0.01)
+    service._bus.gather()
+    service._acted_ns, service._parts.act_ns = 1, 0
+    service._act(world.now_ns + 8 * NS_PER_S)  # as after a stop of the process
+    assert world.where()["a0-00"][1] < cell % 20
 
 
 def test_marks_of_one_agent_spare_another_the_detour() -> None:
