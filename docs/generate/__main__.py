@@ -71,8 +71,7 @@ def _rows(command: Any) -> list[tuple[str, str, str]]:
 
 def ros2() -> str:
     """Returns the page of what `swarm gateway ros2` forwards and of its settings."""
-    settings = scenario_page.settings(Settings)
-    return filled("ros2", table=gateway_settings, settings=settings)
+    return filled("ros2", table=gateway_settings, settings=scenario_page.settings(Settings))
 
 
 def design() -> str:

@@ -150,7 +150,7 @@ def _default(field: msgspec.structs.FieldInfo) -> str:
         return "must be given"
     value = field.default if field.default is not msgspec.NODEFAULT else field.default_factory()
     if value is None:
-        return "none"
+        return ""
     if isinstance(value, msgspec.Struct):
         return "see below"
     if isinstance(value, tuple) and any(isinstance(item, msgspec.Struct) for item in value):

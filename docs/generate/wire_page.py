@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import inspect
+import itertools
 import json
 import re
 import textwrap
@@ -29,15 +30,15 @@ from swarm.wire.versions import read_schemas, written_schema
 
 PATH = Path(__file__).parents[1] / "reference" / "wire.md"
 JSON_PATH = PATH.with_name("wire-json.md")
-_EVERY, _EVERY_OWN = MEMBERS.replace(" ", ", "), MEMBERS.replace(" ", " (role, id), ") + " (role, id)"
 REQUIRED = "required"
 """In place of the default of a field without one."""
 
 
 def document() -> str:
     """Returns the page of keys, access and messages."""
+    first = {part: message for message in reversed(messages()) for part in parts(message)}
     return filled(
-        "wire", topics=TOPICS, messages=messages(), enums=(MarkKind, VehicleState, RouteStatus),
+        "wire", first=first, topics=TOPICS, messages=messages(), enums=(MarkKind, VehicleState, RouteStatus),
         version=WIRE_VERSION, alive_key=ALIVE_KEY, operator=OPERATOR, bus=bus, codec=codec, grid=grid, how=_how,
         link=_link, granted=_granted, schemas=_schemas, struct=_struct, parts=parts, told=_told(),
     )  # fmt: skip
@@ -60,17 +61,18 @@ def json_document() -> str:
 
 def _granted(grants: tuple[Grant, ...]) -> str:
     """The roles of a cell without operators, of which the page says once what they may do."""
-    named = (f"{of.role} ({', '.join(of.own)})" if of.own else of.role for of in grants if of.role != OPERATOR)
-    return ", ".join(named).replace(_EVERY_OWN, "every member (role, id)").replace(_EVERY, "every member")
+    groups = itertools.groupby((of for of in grants if of.role != OPERATOR), key=lambda of: of.own)
+    named = (", ".join(of.role for of in some) + f" ({', '.join(own)})" * bool(own) for own, some in groups)
+    return "; ".join(named).replace(MEMBERS.replace(" ", ", "), "every member")
 
 
 def _how(topic: Topic) -> str:
     ways = []
     if topic.published:
-        ways.append("put, newest counts" if topic.newest else f"put, {topic.buffer} kept")
+        ways.append("put" if topic.newest else f"put, {topic.buffer} kept")
     if topic.request is not None:
         several = f", {_link(topic.bulk)} where asked for" if topic.bulk is not None else ""
-        ways.append(f"get with {_link(topic.request)}{several}")
+        ways.append(f"get {_link(topic.request)}{several}")
     if topic.free:
         ways.append(f"free: {', '.join(topic.free)}")
     return "; ".join(ways)
@@ -103,9 +105,7 @@ def _struct(struct: type[msgspec.Struct]) -> str:
 def rows(struct: type[msgspec.Struct]) -> list[list[str]]:
     """Returns name, type and default of each field."""
     hints = typing.get_type_hints(struct, include_extras=True)
-    return [
-        [field.name, type_text(hints[field.name]), default_text(field)] for field in msgspec.structs.fields(struct)
-    ]
+    return [[each.name, type_text(hints[each.name]), default_text(each)] for each in msgspec.structs.fields(struct)]
 
 
 def parts(struct: type[msgspec.Struct], kind: type[Any] = msgspec.Struct) -> list[Any]:

@@ -255,8 +255,8 @@ HOST_STATE = Topic(
     access(put="agent:agent rover:agent", hear="agent:member"), newest=False, priority=Priority.INTERACTIVE,
     put_bytes=_LONG,
 )  # fmt: skip
-"""Positions and wanted cells of a host's vehicles in a shard, for its leader, or for all members without one; each
-counts, because two generations of a host must not replace each other's messages.
+"""Positions and wanted cells of a host's vehicles in a shard, for its leader, or for all members without one; two
+generations of a host must not replace each other's messages.
 
 Rate: on change, else 5 Hz
 """
@@ -341,7 +341,7 @@ POSE = Topic(
     access(put="targets tracker:target", hear="agent planner targets monitor tracker:target"), newest=False,
     free=("put",), put_bytes=_SHORT,
 )  # fmt: skip
-"""Position of a target, from a tracker; each counts, because trackers must not replace each other's messages.
+"""Position of a target, from a tracker; trackers must not replace each other's messages.
 
 Rate: per quarter of a cell, at least 2 Hz
 """
@@ -365,8 +365,8 @@ OBSTACLE = Topic(
     "body", "body/{id}", vehicles.Obstacle, access(put="rover:id targets", hear="agent rover targets monitor"),
     newest=False, free=("put",), priority=Priority.INTERACTIVE, put_bytes=_SHORT,
 )  # fmt: skip
-"""Position of an obstacle, such as an outside vehicle or a person; each counts, because two senders under one id
-must not replace each other's messages.
+"""Position of an obstacle, such as an outside vehicle or a person; two senders under one id must not
+replace each other's messages.
 
 Rate: 10 Hz in motion, else at least 1 Hz
 """

@@ -22,9 +22,7 @@ class RunInfo(Message, frozen=True, kw_only=True, tag=schema_of("run")):
     vehicles, crew            how many vehicles the scenario has, and which processes it needs, as `role-id`
     restarts                  how often the process was started again in this run
     classes                   the classes of vehicles beside "ground", in the order of their numbers
-    wire_version              of its build. This message is read by builds of all wire versions: it never steps to
-                              another version, so that each can say which the other speaks
-                              (docs/design/wire-format.md)
+    wire_version              of its build. This message never steps to another version (docs/design/wire-format.md)
     shard_cells               side of a shard of right of way: two layouts in one run would grant a cell twice
     """
 

@@ -37,7 +37,7 @@ _Place = Annotated[bytes, fields.Column("<f4", per="ids", least=-1e9, most=1e9)]
 
 
 class Fleet(Message, frozen=True, kw_only=True, tag=schema_of("fleet")):
-    """The vehicles of one agent process inside one region, at one instant. The newest replaces the older.
+    """The vehicles of one agent process inside one region, at one instant.
 
     east_m       from the grid's west border; south_m from its north border
     heading_rad  clockwise from north
@@ -66,7 +66,7 @@ class Fleet(Message, frozen=True, kw_only=True, tag=schema_of("fleet")):
 
 
 class Chasers(Message, frozen=True, kw_only=True, tag=schema_of("chasers")):
-    """The vehicles of one agent process that chase one target, or that go to places. The newest replaces the older.
+    """The vehicles of one agent process that chase one target, or that go to places.
 
     target  None of those that go to places
     cells   one that each vehicle may stand on or enter, where a new route for it may begin
@@ -92,8 +92,7 @@ MOST_SHARED_TARGETS = 64
 
 
 class SharedCosts(Message, frozen=True, kw_only=True, tag=schema_of("shared-costs")):
-    """Costs from the vehicles of one agent to each target, for the other agents of their group. The newest replaces
-    the older.
+    """Costs from the vehicles of one agent to each target, for the other agents of their group.
 
     costs_s  per vehicle and target, the targets of one vehicle side by side; inf where there is no way
     targets  the one that each vehicle chases, as an index into target_ids, NO_TARGET for none of these
