@@ -180,11 +180,9 @@ def test_shared_cell_costs_that_no_map_has_are_refused(bad: float) -> None:
         ground.share(np.array([1.0] * 15 + [bad], np.float32))
 
 
-@pytest.mark.parametrize(
-    ("metres", "weight"), [(math.inf, 0.0), (1e200, 0.0), (1.0, -1.0), (1.0, math.nan)]
-)
+@pytest.mark.parametrize(("metres", "weight"), [(math.inf, 0.0), (1e200, 0.0), (1.0, -1.0), (1.0, math.nan)])
 def test_lengths_that_no_map_has_are_refused(metres: float, weight: float) -> None:
-    with pytest.raises(ValueError, match="length_weight|resolution_m"):
+    with pytest.raises(ValueError, match=r"length_weight|resolution_m"):
         CostGrid(GridSpec(2, 2, metres), PlannerConfig(length_weight=weight))
 
 
