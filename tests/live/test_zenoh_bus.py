@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import json
 import os
+import re
 import signal
 import socket
 import subprocess
@@ -319,7 +320,9 @@ def test_closing_takes_seconds_at_most_though_the_router_hangs_and_does_not_abor
     words = [sys.executable, "-c", LEAVES_A_STALLED_ROUTER, world.router.endpoint, str(router)]
     ended = subprocess.run(words, capture_output=True, text=True, timeout=90, check=False)
     os.kill(router, signal.SIGCONT)
-    assert (ended.returncode, ended.stderr.splitlines()[-1]) in ((1, "closed in 3 s"), (1, "closed in 4 s"))
+    # At once, if Zenoh has given the router up before; else after `_CLOSE_S`, and the thread that closes goes on.
+    assert re.fullmatch("closed in [0-4] s", ended.stderr.splitlines()[-1])
+    assert ended.returncode == 1
 
 
 def test_nobody_to_reach_is_a_sentence(world):
