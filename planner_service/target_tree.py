@@ -294,7 +294,7 @@ class TargetTree:
 
     def routes(self, cells: Any, max_cells: int = 0) -> RouteBatch:
         """A route from each cell, in order; statuses, no exceptions. 0 for `max_cells` is the whole route."""
-        asked = np.asarray(cells, np.int64).reshape(-1)
+        asked = _in_a_row(cells)
         if not self.ready:
             return RouteBatch.none(asked, NO_TARGET)
         self._reach(asked)
@@ -306,7 +306,7 @@ class TargetTree:
 
     def cost_to_go_at(self, cells: Any) -> Floats:
         """float32, s, per cell; inf where there is no path or the cell is outside."""
-        asked = np.asarray(cells, np.int64).reshape(-1)
+        asked = _in_a_row(cells)
         costs: Floats = np.full(asked.size, np.inf, np.float32)
         if self.ready:
             inside = (asked >= 0) & (asked < self._grid.cells)
@@ -317,7 +317,7 @@ class TargetTree:
 
     def may_reach(self, cells: Any, costs_s: Floats) -> bool:
         """Returns True if a growth that has stopped may still find a way for one of the cells without a cost."""
-        unknown = np.asarray(cells, np.int64).reshape(-1)[np.isinf(costs_s)]
+        unknown = _in_a_row(cells)[np.isinf(costs_s)]
         return not self._is_whole and self._open(unknown).size > 0
 
     # --- how ----------------------------------------------------------------------------------------------------
@@ -545,7 +545,7 @@ class TargetTree:
         """Returns True if these cells are answered for good; if not, a worker's tree is to come."""
         if not self.ready or self._is_whole:
             return self.ready
-        self._reach(np.asarray(cells, np.int64).reshape(-1))
+        self._reach(_in_a_row(cells))
         return self._is_whole or not self._without_path(self._open(cells)).size
 
     def _reach(self, asked: NDArray[np.int64]) -> None:
@@ -593,7 +593,7 @@ class TargetTree:
 
     def _open(self, cells: Any) -> NDArray[np.int64]:
         """Those of some numbers that are passable cells of the grid, padded."""
-        return self._look(np.asarray(cells, np.int64).reshape(-1))[0]
+        return self._look(_in_a_row(cells))[0]
 
     def _look(self, asked: NDArray[np.int64]) -> tuple[NDArray[np.int64], int, int]:
         """Returns those of some numbers that are passable cells of the grid, padded; how many of them a growth that
@@ -696,5 +696,10 @@ class TargetTree:
         return self.strategy.renews_within_budget and moves > 0 and moves * self.times.budget_ns >= costs_ns
 
     def _inside(self, cells: Any) -> NDArray[np.int64]:
-        asked = np.asarray(cells, np.int64).reshape(-1)
+        asked = _in_a_row(cells)
         return asked[(asked >= 0) & (asked < self._grid.cells)]
+
+
+def _in_a_row(cells: Any) -> NDArray[np.int64]:
+    """Numbers as kernels take them: side by side in memory, whatever list or part of an array they are."""
+    return np.ascontiguousarray(cells, np.int64).reshape(-1)
