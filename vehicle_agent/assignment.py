@@ -131,8 +131,10 @@ def shares_costs(assigner: Assigner) -> bool:
 
 
 def assigner_of(plugin: Plugin, world: AssignmentWorld, tell: Tell) -> Assigner:
-    """The assigner that a scenario names. Raises ConfigError if it cannot be made; `tell` is called with a later
-    fault."""
+    """Returns the assigner that a scenario names, built-in or a plug-in. Raises ConfigError if it cannot be made.
+
+    tell  called with the fault if the plug-in fails later
+    """
     if plugin.factory is None:
         return ASSIGNERS[plugin.named.name](world)
     return PluginAssigner(plugin.make(world), Guard(plugin, tell))

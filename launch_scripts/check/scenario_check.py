@@ -54,7 +54,7 @@ def files_of(scenario: Scenario) -> dict[str, str]:
 
 
 def files_named(scenario: Scenario) -> Iterator[Finding]:
-    """Files of terrain and zones that are not there, or are no files."""
+    """Yields a failure for each named file that does not exist, is no file of its kind or cannot be opened."""
     for key, name in files_of(scenario).items():
         yield from _of_source(name) if key == "terrain.source" else _of_file(key, Path(name))
 

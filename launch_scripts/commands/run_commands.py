@@ -229,7 +229,7 @@ def ps(all: Annotated[bool, typer.Option("--all", "-a")] = False, as_json: AsJso
 
 @command(app, RUN)
 def down(run: RunArgument = None) -> int:
-    """End a run of this machine as Ctrl-C does, and wait for its report: up to a minute on a busy machine.
+    """End a run of this machine as Ctrl-C does, and wait for its report, at most two minutes.
 
     If the run has not ended, a second `swarm down` kills the processes that are left. If the launcher is gone, the
     first one kills them.

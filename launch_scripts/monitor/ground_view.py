@@ -82,6 +82,7 @@ class Area:
 class Scene:
     """Inputs of drawing a run that are known beforehand.
 
+    pen     draws on the recording stream, on the mesh of the terrain
     layers  tabs of the view
     truth   the true ground, where this process knows it
     zones   those of the scenario

@@ -55,7 +55,10 @@ class Merged:
 class MapReplica:
     """Holds the newest set of every (tile, author), and keeps a cost map at the winning statements.
 
+    grid           the grid of the map
+    cost_map       receives winning statements; None: only the sets are kept
     author         id under which `write` speaks; None: this replica only listens
+    group          group of vehicles for which `write` speaks; replicas may read some groups only
     publish_hz     each tile's own set goes out at most this often
     capacity       bounds of what it holds of others
     filter         whose sets it takes in, and about which tiles; default: all

@@ -369,8 +369,11 @@ class Bus(Protocol):
         ...
 
     def collect(self, topic: Topic, **fields: str | int) -> None:
-        """Keeps samples from now on until `gather`, the newest `Topic.buffer`. For samples that are used at
-        ticks only: a sample that wakes no thread costs a fifth."""
+        """Subscribes without events: samples are kept until `gather`, at most the newest `Topic.buffer` of them.
+
+        Meant for samples that are used at ticks only. A sample that wakes no thread costs a fifth of one that
+        does.
+        """
         ...
 
     def gather(self) -> None:

@@ -58,7 +58,11 @@ class FileKind(Enum):
         self.error = error
 
     def refusal(self, path: Path, why: str, what: str = "") -> SwarmError:
-        """The error which says that a file cannot be read; `what` names it and its place, else its kind does."""
+        """Returns the error of a file that cannot be read.
+
+        why   reason, the end of the sentence
+        what  the file and the key that names it, in words; empty: the kind and the path
+        """
         return self.error(f"cannot read {what or f'{self.what} {path}'}: {why}")
 
     def unreadable(self, path: Path, error: OSError) -> SwarmError:

@@ -195,7 +195,7 @@ class RightOfWaySync:
         return False
 
     def hear(self, message: Message, now_ns: int) -> list[str]:
-        """Takes up what a host or a leader says. Returns the vehicles that have found their places by it."""
+        """Handles a message of a host or of a shard's leader. Returns the vehicles whose places it settles."""
         match message:
             case traffic.Left():
                 return self.core.host.hear_left(message)

@@ -106,7 +106,7 @@ class FairQueue(Generic[T]):
         self._drop(flow)
 
     def take(self, newest: Callable[[T], bool] = lambda oldest: False) -> T | None:
-        """Removes the next item and returns it.
+        """Removes the next item and returns it; None if there is none.
 
         newest  called with the oldest item of the sender whose turn it is: true to take the sender's newest instead
         """

@@ -194,7 +194,8 @@ class Member:
         return False
 
     def tick(self, now_ns: int) -> None:
-        """Names new strangers; publishes the counters once a second."""
+        """Performs all work that is due: reports a restart at the first tick, reports a link after another router
+        appeared, names new strangers, and publishes the counters once a second."""
         if not self._now_ns and self.info.restarts:
             text = f"{self._name} was started again, restart {self.info.restarts}"
             self.alarms.happened("restarted", self._name, text, now_ns)
@@ -267,7 +268,12 @@ class Member:
     def note(
         self, now_ns: int, kind: str, text: str, cell: int | None = None, *, target: str | None = None
     ) -> None:
-        """Publishes a sentence for people who watch the run."""
+        """Publishes a sentence for people who watch the run, as a `Note`.
+
+        kind    word by which programs tell events apart
+        cell    place of the event, if it has one
+        target  target which the event is about, if any
+        """
         info = self.info
         note = Note(
             role=info.role, id=info.id, stamp_ns=now_ns, kind=kind, text=text[:MOST_TEXT], cell=cell, target=target
@@ -336,8 +342,10 @@ def check_belongs(mine: RunInfo, others: Iterable[RunInfo]) -> None:
 
 
 def check_same_run(mine: RunInfo, other: RunInfo) -> None:
-    """Raises RunMismatchError, with a sentence on the difference, where two processes must not share a
-    namespace."""
+    """Raises RunMismatchError, with a sentence on the difference, if two processes must not share a namespace.
+
+    They may if run id, terrain, size of shards and vehicle classes are equal, and their wire versions neighbours.
+    """
     who = f"{other.role} {other.id}"
     if other.run_id != mine.run_id:
         raise RunMismatchError(

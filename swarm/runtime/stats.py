@@ -75,8 +75,8 @@ class Histogram:
         self.buckets[bucket] = self.buckets.get(bucket, 0) + times
 
     def add_all(self, values: NDArray[np.float64]) -> None:
-        """Like `add` for each value, the positive ones first and in order: the order of buckets reaches the
-        wire."""
+        """Counts each value as `add` does, in a fixed order because the order of buckets reaches the wire: positive
+        values from the least to the greatest, then all others."""
         if values.size <= _FEW:
             for value in sorted(values.tolist(), key=lambda value: (value <= 0, value)):
                 self.add(value)

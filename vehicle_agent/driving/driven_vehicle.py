@@ -354,7 +354,8 @@ class Vehicle:
 
     @property
     def needs_nothing(self) -> bool:
-        """True if `route_request` returns no reason however long the vehicle rolls on."""
+        """True if the vehicle chases a target and has more than `PREFETCH_CELLS` cells of route left:
+        `route_request` then returns None, and need not be called."""
         goes = self.target is not None and self.goal is None and not self.in_reach and self._need is None
         return goes and self.state is not VehicleState.STRANDED and self.route.left > PREFETCH_CELLS
 
@@ -463,7 +464,7 @@ class Vehicle:
 class Places:
     """Vehicles and their places at one instant, in one order.
 
-    vehicles
+    vehicles     in the order of all arrays
     cells        int64 (n,), flat indices
     regions      int64 (n,)
     east_m       float64 (n,), from the grid's west border

@@ -119,7 +119,7 @@ class Robot:
             self._hear_route(route)
 
     def close(self) -> None:
-        """Takes it away, with all that was declared for it."""
+        """Removes the robot from the swarm, and its endpoints from the ROS graph."""
         self._leave()
         for each in (self._poses, self._goals, self._plan, self._certificate, self._goal_out):
             self._node.remove(each.endpoint)

@@ -183,7 +183,12 @@ def _ground(
 
 
 def water_signs(f: Features) -> Bytes:
-    """Returns for each cell its signs of LIKELY, CERTAIN and STILL water."""
+    """Returns the signs of water in each cell, as a sum of bits.
+
+    LIKELY   colour or darkness of water, on ground which is no slope: may be part of a lake
+    CERTAIN  colour of water on smooth or level ground: a lake has a fifth of such cells
+    STILL    level as a lake, whatever the colour
+    """
     dead_level = f.grade < STILL_GRADE
     # Sky light in a shadow is blue, not green: a lake is both.
     teal = (f.blue > 1.45 * f.red) & (f.green > 1.4 * f.red)

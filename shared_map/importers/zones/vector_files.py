@@ -55,6 +55,7 @@ class Layer:
     source   GDAL's name of the file, or its content as GeoJSON
     what     name in sentences
     index    its number in the file
+    name     its name in the file
     crs      as the file has it; empty if it has none
     columns  names of its attributes
     count    features which the file says that it holds; -1 if it does not
