@@ -13,7 +13,7 @@ from swarm.wire.messages import Message, schema_of
 
 
 class RunInfo(Message, frozen=True, kw_only=True, tag=schema_of("run")):
-    """The run that a process belongs to. `terrain` is a digest of grid, prior pace and cost rules: processes with
+    """The run that a process belongs to. `terrain` is a digest of grid, pace without marks and cost rules: processes with
     different ones must not share a map.
 
     rows, cols, resolution_m  of the grid; 0 of a router, which has none
