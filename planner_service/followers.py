@@ -213,7 +213,7 @@ class Followers:
             del self._told[author]
 
     def any_due_in(self, changed: Sequence[Window], now_ns: int) -> bool:
-        """Returns True if one of these windows lies on the route of a follower to which a new route may be pushed now."""
+        """Returns True if one of these windows lies on the route of a follower which may be pushed another now."""
         return any(now_ns >= each.push_ns and self._crosses(each, window) for each, window in self._near(changed))
 
     def touch(self, window: Window, changed: Sequence[Window]) -> None:

@@ -207,10 +207,8 @@ def example(topic: Topic) -> str:
     """The shortest JSON for a topic: its key, and what its message needs and the key does not say."""
     hints = typing.get_type_hints(topic.message, include_extras=True)
     needed = [f.name for f in msgspec.structs.fields(topic.message) if f.required and f.name not in topic.fields]
-    fields = {name: _value(name, hints[name]) for name in needed}
-    if topic is topics.MARKS:
-        fields["seq"] = SEQ_STEP
-    return json.dumps({"key": topic.below(key_fields(topic))} | fields)
+    given = {n: _value(n, hints[n]) for n in needed} | ({"seq": SEQ_STEP} if topic is topics.MARKS else {})
+    return json.dumps({"key": topic.below(key_fields(topic))} | given)
 
 
 def _value(name: str, hint: Any) -> Any:

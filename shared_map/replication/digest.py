@@ -151,8 +151,8 @@ _NAME_BYTES = 80
 
 
 def parts_of(held: Held, most_bytes: int) -> Iterator[tuple[dict[str, bytes], Place | None, Place | None]]:
-    """Splits the rows of a digest into parts. Yields (rows by author, `after`, `until`) of each; the last two are those
-    of `Digest`. One part if all fit.
+    """Splits the rows of a digest into parts, one if all fit. Yields (rows by author, `after`, `until`) of each;
+    the last two as in `Digest`.
 
     held        author -> rows; authors in order, the rows of each in order of tile
     most_bytes  of a part: its rows and the names of its authors

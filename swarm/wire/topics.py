@@ -255,8 +255,8 @@ HOST_STATE = Topic(
     access(put="agent:agent rover:agent", hear="agent:member"), newest=False, priority=Priority.INTERACTIVE,
     put_bytes=_LONG,
 )  # fmt: skip
-"""Positions and wanted cells of a host's vehicles in a shard: to its leader, or to all members while it has none. Each
-counts, as two generations of a host may send.
+"""Positions and wanted cells of a host's vehicles in a shard: to its leader, or to all members while it has none.
+Each counts, as two generations of a host may send.
 
 Rate: on change, else 5 Hz
 """

@@ -137,8 +137,6 @@ class MarkSet(Message, frozen=True, kw_only=True, gc=False, tag=schema_of("marks
     paces      s/m for PACE, ignored otherwise
     stamps_ns  hybrid logical time of each mark
     untils_ns  when each mark ends by itself, FOREVER (2^63 - 1) if it does not; empty if none does
-
-    A set is checked when it is decoded (`check`), not when it is made: the marks of many sets are checked at once, by the rules of `swarm.wire.messages.map_data`.
     """
 
     author: fields.Id
@@ -152,6 +150,7 @@ class MarkSet(Message, frozen=True, kw_only=True, gc=False, tag=schema_of("marks
     stamps_ns: _Stamps
     untils_ns: Annotated[bytes, Meta(max_length=8 * TILE_AREA), fields.Column("<i8")] = b""
 
+    # A set is checked when it is decoded (`check`), not when it is made: those of many sets at once.
     def __post_init__(self) -> None:
         pass
 
@@ -222,7 +221,7 @@ _Place = tuple[fields.Id, fields.Tile]
 class Digest(Message, frozen=True, kw_only=True, tag=schema_of("digest")):
     """Sets that a replica holds: author -> columns of tile (uint32), epoch and seq (uint64 each), interleaved as
     rows of 20 bytes. An author's own digest is complete for that author; the keeper's covers what it committed.
-    Only a keeper names sets of others (`is_keeper`); a field that says so counts for nothing.
+    Only a keeper (by `author`) names sets of others.
 
     role   of its sender; not used
     whole  false: only tiles that changed lately, published between the whole digests; or a part of a whole one
@@ -310,7 +309,7 @@ class BaseMapRequest(Message, frozen=True, kw_only=True, tag=schema_of("base-map
 
 class BaseMapTile(Message, frozen=True, kw_only=True, tag=schema_of("base-map-tile")):
     """One layer of one region. `data` is zlib of the values' bytes: first the lowest byte of every value, row by
-    row, then the next. Similar bytes side by side compress better."""
+    row, then the next."""
 
     layer: fields.Word
     region: fields.Region
