@@ -54,8 +54,7 @@ def _told() -> dict[str, list[str]]:
 def json_document() -> str:
     """Returns the page of JSON for programs outside the swarm."""
     return filled(
-        "wire-json", from_outside=put_from_outside(), outside_roles=OUTSIDE_ROLES, codec=codec,
-        key_fields=key_fields, example=example,
+        "wire-json", topics=put_from_outside(), roles=OUTSIDE, codec=codec, key_fields=key_fields, example=example,
     )  # fmt: skip
 
 
@@ -176,7 +175,7 @@ def number(limit: Any) -> str:
 
 # --- JSON that a person may put: the least that is accepted on each key for programs outside the swarm ---
 
-OUTSIDE_ROLES = tuple(role for role in MEMBERS.split() if role not in STARTED_ROLES)
+OUTSIDE = tuple(role for role in MEMBERS.split() if role not in STARTED_ROLES)
 """Roles of members that no launcher starts."""
 
 _KEY_FIELDS = {"role": "rover", "id": "r1", "target": "t0", "author": "all.r1.1", "region": "0", "tile": "3"}
@@ -195,7 +194,7 @@ def put_from_outside() -> list[Topic]:
     return [
         topic
         for topic in TOPICS
-        if "agent" not in topic.fields and any(grant.role in OUTSIDE_ROLES for grant in topic.access.put)
+        if "agent" not in topic.fields and any(grant.role in OUTSIDE for grant in topic.access.put)
     ]
 
 
