@@ -213,7 +213,7 @@ class Followers:
             del self._told[author]
 
     def any_due_in(self, changed: Sequence[Window], now_ns: int) -> bool:
-        """Returns True if the route of a follower that may be pushed another now passes one of these windows."""
+        """Returns True if one of these windows lies on the route of a follower which may be pushed another now."""
         return any(now_ns >= each.push_ns and self._crosses(each, window) for each, window in self._near(changed))
 
     def touch(self, window: Window, changed: Sequence[Window]) -> None:
@@ -311,7 +311,7 @@ LONGEST_WAIT_NS = NS_PER_S
 
 
 class MapIntake:
-    """Changes of one map that the tree of one target does not know, and whether they may wait."""
+    """Gives the changes of a map to the tree of one target, and decides whether waiting ones are due."""
 
     def __init__(self, cost_map: CostMap, followers: Followers) -> None:
         self._cost_map = cost_map

@@ -151,7 +151,7 @@ class _ClassTrees:
         return _News(self.cost_map.version, copied, windows, following)
 
     def work(self, question: _Question, news: _News | None) -> _Slice:
-        """Takes the news, and answers as much of a question as a slice of cells gives."""
+        """Applies the news to the costs and trees, then works on the question for at most `SLICE_CELLS` cells."""
         changed: Sequence[Window] = ()
         outdone: list[str] = []
         if news is not None and self._version < 0:

@@ -53,9 +53,10 @@ class Sightings:
         self._newest: dict[tuple[str, str], _Seen] = {}
 
     def receive(self, sighted: Sighted, now_ns: int) -> bool:
-        """Takes in a sighting, even an expired one. False if it is no news, filtered out or beyond the limit.
+        """Stores a sighting, even an expired one. Returns False if it is not stored: it is not newer than the
+        author's last one, its author is filtered out, or there are too many.
 
-        An author's sighting with a lower number is news after a silence, as `swarm.peers.Newest` has it.
+        After a silence of the author any of its sightings counts as newer (as in `swarm.peers.Newest`).
         """
         key = (sighted.target, sighted.author)
         known = self._newest.get(key)

@@ -278,7 +278,8 @@ class Agent:
     # --- driving --------------------------------------------------------------------------------------------
 
     def begin_drive(self, now_ns: int) -> None:
-        """Gives every vehicle the time that has passed since it was last driven."""
+        """Begins a step: each vehicle may drive for the time since the last step, at most `_LONGEST_STEP_S`; not at
+        all while obstacles are not received."""
         elapsed_s = 0.0 if self._driven_ns is None else (now_ns - self._driven_ns) / NS_PER_S
         if self.obstacles.is_deaf:
             elapsed_s = 0.0

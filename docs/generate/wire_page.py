@@ -19,10 +19,10 @@ from launch_scripts.process_table import ROLES as STARTED_ROLES
 from swarm import grid
 from swarm.bus import bus
 from swarm.wire import codec, topics
-from swarm.wire.access import MEMBERS, OPERATOR, ROLES, Grant
+from swarm.wire.access import MEMBERS, OPERATOR, Grant
 from swarm.wire.fields import Characters, Column, taken_apart
 from swarm.wire.messages import WIRE_VERSION, Message
-from swarm.wire.messages.map_data import MarkKind
+from swarm.wire.messages.map_data import SEQ_STEP, MarkKind
 from swarm.wire.messages.vehicles import VehicleState
 from swarm.wire.route_columns import RouteStatus
 from swarm.wire.topics import ALIVE_KEY, TOPICS, Topic
@@ -54,8 +54,7 @@ def _told() -> dict[str, list[str]]:
 def json_document() -> str:
     """Returns the page of JSON for programs outside the swarm."""
     return filled(
-        "wire-json", from_outside=put_from_outside(), outside_roles=OUTSIDE_ROLES, codec=codec,
-        key_fields=key_fields, example=example,
+        "wire-json", topics=put_from_outside(), roles=OUTSIDE, codec=codec, key_fields=key_fields, example=example,
     )  # fmt: skip
 
 
@@ -176,13 +175,13 @@ def number(limit: Any) -> str:
 
 # --- JSON that a person may put: the least that is accepted on each key for programs outside the swarm ---
 
-OUTSIDE_ROLES = tuple(role for role in ROLES if role not in STARTED_ROLES)
-"""Roles of programs that no launcher starts."""
+OUTSIDE = tuple(role for role in MEMBERS.split() if role not in STARTED_ROLES)
+"""Roles of members that no launcher starts."""
 
 _KEY_FIELDS = {"role": "rover", "id": "r1", "target": "t0", "author": "all.r1.1", "region": "0", "tile": "3"}
 _VALUES: dict[str, Any] = {
     "group": "all", "role": "rover", "kind": "hello", "text": "battery low", "x_m": 1205.0, "y_m": -860.0,
-    "cell": 3702, "radius_m": 2.0, "seq": 1, "epoch": 1, "held": {"all.r1.1": [[3, 1, 1]]}, "cells": [5, 6],
+    "cell": 3702, "radius_m": 2.0, "seq": 1, "epoch": 1, "held": {"all.r1.1": [[3, 1, SEQ_STEP]]}, "cells": [5, 6],
     "kinds": [1, 1], "paces": [0, 0], "incarnation": 1790000000000000000, "stamp_ns": 1790000000000000000,
     "stamps_ns": [1790000000000000000, 1790000000000000000],
 }  # fmt: skip
@@ -195,7 +194,7 @@ def put_from_outside() -> list[Topic]:
     return [
         topic
         for topic in TOPICS
-        if "agent" not in topic.fields and any(grant.role in OUTSIDE_ROLES for grant in topic.access.put)
+        if "agent" not in topic.fields and any(grant.role in OUTSIDE for grant in topic.access.put)
     ]
 
 
@@ -207,7 +206,8 @@ def example(topic: Topic) -> str:
     """The shortest JSON for a topic: its key, and what its message needs and the key does not say."""
     hints = typing.get_type_hints(topic.message, include_extras=True)
     needed = [f.name for f in msgspec.structs.fields(topic.message) if f.required and f.name not in topic.fields]
-    return json.dumps({"key": topic.below(key_fields(topic))} | {n: _value(n, hints[n]) for n in needed})
+    given = {n: _value(n, hints[n]) for n in needed} | ({"seq": SEQ_STEP} if topic is topics.MARKS else {})
+    return json.dumps({"key": topic.below(key_fields(topic))} | given)
 
 
 def _value(name: str, hint: Any) -> Any:

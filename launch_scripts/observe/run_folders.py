@@ -236,7 +236,8 @@ def begin_run(
 
 
 def ended(folder: Path) -> dict[str, Any]:
-    """The facts of `run.json` with the time of now as the run's end, for the report. Empty if there are none."""
+    """Returns those facts of `run.json` which a report needs, with the current time as the end of the run; empty if
+    there is no such file."""
     facts = run_facts(folder)
     kept: dict[str, Any] = {name: facts[name] for name in ("versions", "machine") if name in facts}
     return {"began": facts.get("began"), "ended": _now(), **kept} if facts else {}

@@ -151,10 +151,11 @@ _NAME_BYTES = 80
 
 
 def parts_of(held: Held, most_bytes: int) -> Iterator[tuple[dict[str, bytes], Place | None, Place | None]]:
-    """The rows of a digest in parts, with the range of each as in `Digest`. One part if all fit.
+    """Splits the rows of a digest into parts, one if all fit. Yields (rows by author, `after`, `until`) of each;
+    the last two as in `Digest`.
 
-    held        in order of author, its rows in order of tile
-    most_bytes  of the rows and names in one part
+    held        author -> rows; authors in order, the rows of each in order of tile
+    most_bytes  of a part: its rows and the names of its authors
     """
     part: dict[str, bytes] = {}
     left, after, last = most_bytes, None, None

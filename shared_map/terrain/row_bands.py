@@ -51,7 +51,8 @@ def in_bands(
 
 
 def counted(labels: NDArray[np.signedinteger[Any]], count: int, where: Bools | None = None) -> NDArray[np.int64]:
-    """Cells of each label below `count`, where `where` is true. NumPy's own takes a wide copy of all labels."""
+    """Number of cells with each label below `count`; if given, only of cells where `where` is true.
+    `np.bincount` on all labels at once would copy them as wider integers."""
     cells = np.zeros(count, np.int64)
     for row0, row1 in bands(labels.shape[0]):
         band = labels[row0:row1]

@@ -242,8 +242,8 @@ class Board:
         self._slot = 1 - self._slot
 
     def read(self) -> Vitals | None:
-        """Returns the last record; None if there is none. Called by any thread, of any process that has the
-        memory."""
+        """Returns the last complete record; None if there is none. Any thread may call it, in any process
+        which maps the memory."""
         found = [_record(bytes(self._memory[at : at + SLOT_BYTES])) for at in (0, SLOT_BYTES)]
         return max((each for each in found if each is not None), default=None)
 

@@ -255,8 +255,8 @@ HOST_STATE = Topic(
     access(put="agent:agent rover:agent", hear="agent:member"), newest=False, priority=Priority.INTERACTIVE,
     put_bytes=_LONG,
 )  # fmt: skip
-"""Positions and wanted cells of a host's vehicles in a shard, for its leader, or for all members without one; two
-generations of a host must not replace each other's messages.
+"""Positions and wanted cells of a host's vehicles in a shard: to its leader, or to all members while it has none.
+Each counts, as two generations of a host may send.
 
 Rate: on change, else 5 Hz
 """
@@ -265,8 +265,8 @@ TABLE = Topic(
     access(put="agent:agent", serve="agent:agent", ask="agent:member", hear="agent:member"), request=traffic.Claim,
     echoed=False, priority=Priority.INTERACTIVE, put_bytes=_LONG, ask_bytes=_SHORT, answer_bytes=_LONG,
 )  # fmt: skip
-"""Granted cells of a shard, from its leader to a member; a member that is asked promises an epoch and replies with
-its stored table.
+"""Granted cells of a shard, from its leader to a member. A query claims leadership: the member promises to store no
+table of an older epoch, and replies with its stored one.
 
 Rate: on change, and at 5 Hz until the others have it on file
 """
@@ -282,7 +282,8 @@ WORD = Topic(
     "word", "word/{shard}/{host}/{agent}", traffic.Word, access(put="agent:agent", hear="agent:host rover:host"),
     priority=Priority.INTERACTIVE, put_bytes=_SHORT,
 )  # fmt: skip
-"""Digest of a member's file for a host, which uses a grant that a majority confirms; only with certificates.
+"""Digest of what a member has on file for a host, which uses a grant once a majority confirms it; only with
+certificates.
 
 Rate: on change, else 5 Hz
 """
@@ -291,7 +292,7 @@ LEFT = Topic(
     access(put="agent:agent rover:agent", hear="agent:host rover:host"), newest=False,
     priority=Priority.INTERACTIVE, put_bytes=_LONG,
 )  # fmt: skip
-"""Cells which vehicles of a host have left, for a host whose vehicles follow; each counts.
+"""Cells which vehicles of a host have left, to a host whose vehicles wait for them; each counts.
 
 Rate: on change, and at 5 Hz until the leader has counted it
 """
@@ -301,7 +302,7 @@ STORED = Topic(
 )  # fmt: skip
 """Number of a member's table on file.
 
-Rate: per table by one member, 5 Hz by the other; 5 Hz by the leader instead of an unchanged table
+Rate: per table by one member, 5 Hz by the others; 5 Hz by the leader instead of an unchanged table
 """
 KNOWN = Topic(
     "known", "known/{agent}", traffic.Known, access(serve="agent:agent", ask="agent rover"),
@@ -402,7 +403,7 @@ NAMELESS_ROUTE = replace(
     ROUTE, name="nameless-route", key="target/{target}/route",
     access=access(serve="planner:target", ask="agent rover"),
 )  # fmt: skip
-"""The same for askers without a name, which share one turn.
+"""Routes for askers without a name, who take turns as one.
 
 Rate: asked
 """
@@ -410,7 +411,7 @@ NAMELESS_COST = replace(
     COST, name="nameless-cost", key="target/{target}/cost",
     access=access(serve="planner:target", ask="agent targets monitor rover"),
 )  # fmt: skip
-"""The same for askers without a name, which share one turn.
+"""Costs for askers without a name, who take turns as one.
 
 Rate: asked
 """
@@ -461,7 +462,7 @@ ORDERS = Topic(
     access(put="keeper:role,id", serve=OBEYING_OWN, ask=OBEYING, hear=f"{OBEYING} monitor"), request=Nothing,
     priority=Priority.INTERACTIVE, put_bytes=4 * _LONG, ask_bytes=_SHORT, answer_bytes=4 * _LONG,
 )  # fmt: skip
-"""Orders in force, from keepers; without a keeper, from any process to a starting one.
+"""Orders in force, from keepers. A starting process which finds no keeper asks any other.
 
 Rate: 1 Hz, and on change
 """

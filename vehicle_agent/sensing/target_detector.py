@@ -90,7 +90,7 @@ class TargetDetector:
             self._retell_ns[target] = now_ns + _RETELL_NS
 
     def retold(self, now_ns: int) -> list[Sighted]:
-        """Last sightings to publish once more, as they were."""
+        """Returns the unchanged last sightings whose repetition (`retell`) is due; each is repeated once."""
         due = [target for target, at_ns in self._retell_ns.items() if now_ns >= at_ns]
         for target in due:
             del self._retell_ns[target]

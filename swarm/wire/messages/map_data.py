@@ -125,20 +125,18 @@ class MarkSet(Message, frozen=True, kw_only=True, gc=False, tag=schema_of("marks
     """All marks of one author in one tile. Replaces the author's set with a lower (epoch, seq).
 
     An author counts `seq` in steps of 65536. The numbers between are for keepers, which compact the sets of dead
-    authors: drop from them what others overrule. Such a set without statements is a tombstone: readers forget the
-    tile of that author.
+    authors: they drop marks which others overrule. Such a set without marks is a tombstone: readers drop the
+    author's marks in that tile.
 
-    tile       of a grid of N tiles: 0 ... N - 1 for all vehicles; N tells what its author has learned; tile
-               n (N + 1) + t is tile t for the n-th of the scenario's classes alone
+    tile       in a grid of N tiles, 0 to N - 1 are tiles for all vehicles, row by row from the north-west. N holds
+               the author's learned factors. n (N + 1) + t is tile t for vehicle class n only
+    epoch      1; the next whenever a keeper took the living author for dead
 
     cells      indices inside the tile, row-major over 32 x 32, strictly increasing
     kinds      MarkKind
     paces      s/m for PACE, ignored otherwise
-    stamps_ns  hybrid logical time of each statement
-    untils_ns  when each statement ends by itself, FOREVER if it does not; empty if none does
-
-    A set is checked when it is decoded (`check`), not when it is made: the statements of many sets are checked at
-    once, by the rules of `swarm.wire.messages.map_data`.
+    stamps_ns  hybrid logical time of each mark
+    untils_ns  when each mark ends by itself, FOREVER (2^63 - 1) if it does not; empty if none does
     """
 
     author: fields.Id
@@ -152,6 +150,7 @@ class MarkSet(Message, frozen=True, kw_only=True, gc=False, tag=schema_of("marks
     stamps_ns: _Stamps
     untils_ns: Annotated[bytes, Meta(max_length=8 * TILE_AREA), fields.Column("<i8")] = b""
 
+    # A set is checked when it is decoded (`check`), not when it is made: those of many sets at once.
     def __post_init__(self) -> None:
         pass
 
@@ -222,9 +221,9 @@ _Place = tuple[fields.Id, fields.Tile]
 class Digest(Message, frozen=True, kw_only=True, tag=schema_of("digest")):
     """Sets that a replica holds: author -> columns of tile (uint32), epoch and seq (uint64 each), interleaved as
     rows of 20 bytes. An author's own digest is complete for that author; the keeper's covers what it committed.
-    Only a keeper names sets of others (`is_keeper`); a field that says so counts for nothing.
+    Only a keeper (by `author`) names sets of others.
 
-    role   read by wire version 8 only
+    role   of its sender; not used
     whole  false: only tiles that changed lately, published between the whole digests; or a part of a whole one
     seq    counts this sender's digests, so that one that comes late replaces no newer one; 0 if it does not count
     after  of a part: the author and the tile after which it begins; none if it begins with the first
@@ -310,7 +309,7 @@ class BaseMapRequest(Message, frozen=True, kw_only=True, tag=schema_of("base-map
 
 class BaseMapTile(Message, frozen=True, kw_only=True, tag=schema_of("base-map-tile")):
     """One layer of one region. `data` is zlib of the values' bytes: first the lowest byte of every value, row by
-    row, then the next. Similar bytes side by side compress better."""
+    row, then the next."""
 
     layer: fields.Word
     region: fields.Region

@@ -226,7 +226,7 @@ class VehicleGoals(fields.Bounded, frozen=True, kw_only=True):
     stamp_ns  of two orders about one vehicle the later counts
     off       recalled: it chases targets
     cells     the places, in order
-    then      what it does after the last: hold there, chase targets, or begin again
+    then      as in `SendVehicle`
     done      how many it has reached, laps included
     """
 

@@ -214,7 +214,7 @@ POSE_LEASE_S = 2.0
 
 
 class TargetPose(Message, frozen=True, kw_only=True, tag=schema_of("pose")):
-    """Position of a target, by one of its trackers. `swarm.runtime.tracker_ownership` decides which poses count.
+    """Position of a target, by one of its trackers (`swarm.runtime.tracker_ownership`).
 
     tracker      name of the tracker; a later incarnation of the same name takes over at once. Without a name each
                  incarnation is a tracker of its own

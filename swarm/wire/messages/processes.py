@@ -13,8 +13,8 @@ from swarm.wire.messages import Message, schema_of
 
 
 class RunInfo(Message, frozen=True, kw_only=True, tag=schema_of("run")):
-    """The run that a process belongs to. `terrain` is a digest of grid, prior pace and cost rules: processes with
-    different ones must not share a map.
+    """The run that a process belongs to. `terrain` is a digest of grid, pace without marks and cost rules:
+    processes with different ones must not share a map.
 
     rows, cols, resolution_m  of the grid; 0 of a router, which has none
     west_m, north_m, crs      where its north-west corner is, and in which coordinate system
@@ -22,7 +22,7 @@ class RunInfo(Message, frozen=True, kw_only=True, tag=schema_of("run")):
     vehicles, crew            how many vehicles the scenario has, and which processes it needs, as `role-id`
     restarts                  how often the process was started again in this run
     classes                   the classes of vehicles beside "ground", in the order of their numbers
-    wire_version              of its build. This message never steps to another version (docs/design/wire-format.md)
+    wire_version              of its build
     shard_cells               side of a shard of right of way: two layouts in one run would grant a cell twice
     """
 

@@ -194,17 +194,17 @@ class Fence(fields.Bounded, frozen=True, array_like=True):
 
 
 class Table(Message, frozen=True, kw_only=True, tag=schema_of("table", 9)):
-    """Entries of one shard, for its members. In a publication its author is the shard's leader; in a reply, a
-    member which tells what it has stored. The entries of a cell are in the order of their numbers.
+    """All entries (cells granted or waited for) of one shard. Its leader publishes it to the members. In a reply it
+    is what a member has on file. The entries of a cell are in the order of their numbers.
 
     hosts   agent -> [generation, seq] of the newest host state that counts in this table
     grants  vehicle -> its entries in driving order
-    fences  entries of generations that may still drive
+    fences  entries of earlier generations, whose vehicles may still drive
     pushed  vehicle -> the age with which it is to make way into another shard
-    without agent -> number of its newest revoked certificate (a0~2 is the second of a0) after which a leader began
-            with what two of three other members had on file
-    since   stamp of an earlier table of the same epoch: `hosts` and `grants` have only what differs from that, an
-            empty one for a vehicle that has no entry any more. None if the table is whole
+    without agent -> number of its newest revoked certificate (a0~2 is the second of a0). A leader began without
+            that member, with what two of the three others had on file
+    since   stamp of an earlier table of the same epoch, from which this one has the differences only: changed
+            `hosts` and `grants`, which are empty for a vehicle without entries now. None if the table is whole
     """
 
     shard: fields.Shard
