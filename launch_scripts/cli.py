@@ -23,7 +23,7 @@ FAMILIES = {
     "order": ("order_commands:app", "Pause a running swarm; change its zones, targets and vehicles.", ORDER),
     "order zone": ("zone_commands:app", "Close areas of a running swarm.", ORDER),
     "order target": ("order_commands:target_app", "Add, move and remove simulated targets.", ORDER),
-    "order vehicle": ("vehicle_commands:app", "Add, remove, stop and start vehicles.", ORDER),
+    "order vehicle": ("vehicle_commands:app", "Send, stop, start, add and remove vehicles.", ORDER),
     "terrain": ("terrain_commands:app", "Inspect and convert terrain; reach maps.", PREPARE),
     "runs": ("result_commands:app", "Compare, export and replay finished runs.", LEFT),
     "marks": ("marks_commands:app", "Inspect and export marks of a store; learned factors.", LEFT),
@@ -46,7 +46,7 @@ class Root(TyperGroup):
       status [--watch]      Show a running swarm
       logs [NAME] [-f]      Show logs of a run
       open [RUN]            Open the live view or the report of a run
-      order ...             Pause, zones, targets, vehicles
+      order ...             Pause, zones, targets; send vehicles
       route ...             Find a route
       terrain ...           Inspect and convert terrain
 
