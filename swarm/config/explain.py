@@ -286,7 +286,12 @@ def choice(word: str, allowed: Sequence[str], lead: str = " allowed: ") -> str:
         return near
     if len(every) > _LONGEST_LIST:
         every = f"{every[: every.rfind(',', 0, _LONGEST_LIST)]}, ..."
-    return f"{near} {lead.strip().capitalize()} {every}" if near else f";{lead}{every}"
+    return near + _listed(near, lead.strip(), every)
+
+
+def _listed(near: str, lead: str, every: str) -> str:
+    """Returns a list as the end of a sentence: as one of its own after a guess, which ends with a question mark."""
+    return f" {lead.capitalize()} {every}" if near else f"; {lead} {every}"
 
 
 # --- a key that is not known -----------------------------------------------------------------------------------
@@ -311,7 +316,7 @@ def _unknown(key: str, name: str, section: Any, root: type) -> str:
 
 def allowed_here(allowed: Sequence[str], near: str = "") -> str:
     """Returns the end of a sentence about an unknown key, after the nearest of the allowed ones."""
-    return f"{' A' if near else '; a'}llowed here: {', '.join(allowed)}"
+    return _listed(near, "allowed here:", ", ".join(allowed))
 
 
 def _places(root: type) -> Iterator[tuple[str, Any]]:
