@@ -545,14 +545,14 @@ class TargetTree:
         """Returns True if these cells are answered for good; if not, a worker's tree is to come."""
         if not self.ready or self._is_whole:
             return self.ready
-        self._reach(_in_a_row(cells))
+        self._reach(cells)
         return self._is_whole or not self._without_path(self._open(cells)).size
 
-    def _reach(self, asked: NDArray[np.int64]) -> None:
+    def _reach(self, cells: Any) -> None:
         """Continues a stopped growth up to these cells."""
         if not self.times.may_stop and self._is_whole:
             return
-        starts, unknown, half = self._look(asked)
+        starts, unknown, half = self._look(cells)
         if not self._is_whole and unknown:
             if self._growth.go_on(starts, self.times.most_cells) < 0:
                 self._too_far = True
@@ -567,7 +567,7 @@ class TargetTree:
         """Notes cells from which queries will come, such as those of a standby's followers: growths will reach
         them."""
         if self.ready and self._can_stop:
-            starts, _, half = self._look(self._inside(cells))
+            starts, _, half = self._look(cells)
             self._note(starts, half)
 
     def _note(self, starts: NDArray[np.int64], half: int) -> None:
@@ -593,11 +593,12 @@ class TargetTree:
 
     def _open(self, cells: Any) -> NDArray[np.int64]:
         """Those of some numbers that are passable cells of the grid, padded."""
-        return self._look(_in_a_row(cells))[0]
+        return self._look(cells)[0]
 
-    def _look(self, asked: NDArray[np.int64]) -> tuple[NDArray[np.int64], int, int]:
+    def _look(self, cells: Any) -> tuple[NDArray[np.int64], int, int]:
         """Returns those of some numbers that are passable cells of the grid, padded; how many of them a growth that
         has stopped did not reach; and how many rows or columns the farthest is away from the root."""
+        asked = _in_a_row(cells)
         grid, starts = self.cost_grid, np.empty(asked.size, np.int64)
         found = grid.cell_cost, self._growth.cost, grid.stride, grid.pad(self._tree.root), asked, starts
         count, unknown, half = open_cells(*found)

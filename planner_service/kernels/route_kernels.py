@@ -368,8 +368,8 @@ def open_cells(cell_cost, cost, stride, root, asked, cells):
 
 @helper
 def _driven_to(grid, parent, start, root):
-    """float64, s: what it costs to drive from a padded cell along the parents as far as beside the root of another
-    tree, and then there; inf if they lead past it, or over what is lethal or shut by now."""
+    """float64, s: cost of the way from a padded cell along the parents to a neighbour of `root`, and from there to
+    `root`. inf if that way passes no neighbour, or is closed by now."""
     cell_cost, offsets, _, rule, corners = grid
     lengths = np.float64(1.0), np.float64(diagonal_length(rule))
     v, driven, least = start, 0.0, np.inf
