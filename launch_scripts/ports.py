@@ -7,8 +7,8 @@ import errno
 import socket
 from itertools import combinations
 
-from swarm.bus.endpoints import host_port
 from swarm.config.scenario import Scenario
+from swarm.endpoints import host_port
 from swarm.errors import BusError, ConfigError
 
 _METRICS = "the metrics (--metrics-port)"

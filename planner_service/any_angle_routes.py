@@ -1,4 +1,4 @@
-"""Routes of a planner, pulled straight (`kernels.route_kernels`)."""
+"""Routes of a planner, pulled straight (`kernels.any_angle_kernels`)."""
 
 from __future__ import annotations
 
@@ -8,9 +8,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from planner_service.kernels.any_angle_kernels import ALL_CORNERS, NO_CORNERS, OPEN_CORNERS, pull_routes
 from planner_service.kernels.decorators import load
 from planner_service.kernels.layout import step_offsets
-from planner_service.kernels.route_kernels import ALL_CORNERS, NO_CORNERS, OPEN_CORNERS, pull_routes
 from shared_map.array_files import Floats
 from shared_map.terrain.slope_and_climb import Climb, may_be_pulled
 from swarm.config.scenario import PlannerConfig

@@ -24,11 +24,13 @@ from pathlib import Path
 from typing import Any
 
 from planner_service.kernels import (
+    any_angle_kernels,
     cell_costs,
     costs_from_parents,
     heap_and_buckets,
     lower_bounds,
     parents_from_costs,
+    partial_growth_kernels,
     piece_totals,
     queue_dial,
     queue_directed,
@@ -54,11 +56,11 @@ FIRST: tuple[Kernel | StepKernel, ...] = (
     parents_from_costs.point_to_parents,
     StepKernel(queue_wide_buckets.grow_by_wide_buckets, None),
     parents_from_costs.untie_parents,
-    StepKernel(route_kernels.box_of, None),
+    StepKernel(partial_growth_kernels.box_of, None),
     StepKernel(route_kernels.point_routes, None),
-    StepKernel(route_kernels.find_aim, None),
+    StepKernel(partial_growth_kernels.find_aim, None),
     StepKernel(queue_dial.begin, None),
-    route_kernels.open_cells,
+    partial_growth_kernels.open_cells,
     cell_costs.pad_cell_costs,
     cell_costs.changed_cells,
     route_kernels.drive_rests,
@@ -92,10 +94,10 @@ LATER: tuple[Kernel | StepKernel, ...] = (
 )
 """For windows, repairs, strides and pieces, which save growing whole trees."""
 
-GOALS = route_kernels.walk_by_costs, queue_dial.resume, route_kernels.stays_exact
+GOALS = route_kernels.walk_by_costs, queue_dial.resume, partial_growth_kernels.stays_exact
 """Beside those of `FIRST`, for `GoalTrees`."""
 
-PULL = route_kernels.pull_routes
+PULL = any_angle_kernels.pull_routes
 """Only for planners that pull their routes."""
 
 _POLL_S = 0.1

@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 
 from planner_service.growth_times import Askers, GrowthTimes, WindowSchedule, exact_half
 from planner_service.kernels.layout import NONE
-from planner_service.kernels.route_kernels import UNREACHABLE, open_cells
+from planner_service.kernels.partial_growth_kernels import open_cells
+from planner_service.kernels.route_kernels import UNREACHABLE
 from planner_service.kernels.stride_networks import StrideNetwork
 from planner_service.strategy import OnMove, Strategy, StrategyRow, whole_trees_only
 from planner_service.tree import partitioned_tree

@@ -25,14 +25,13 @@ from shared_map.terrain.row_bands import counted
 from shared_map.terrain.terrain import Terrain, build_terrain
 from shared_map.terrain.true_ground import build_truth
 from shared_map.vehicle_class_grounds import ClassGround, class_grounds
-from swarm.bus.endpoints import host_port
-from swarm.config.contradictions import is_loopback
 from swarm.config.explain import choice, nearest
 from swarm.config.input_files import FileKind, check_file, quoted, read_text, size
 from swarm.config.plugin_names import plugins_of
 from swarm.config.scenario import Scenario, TlsConfig, plan_agents
 from swarm.config.scenario_files import BUILT_IN_TERRAINS, Reading, read_scenario, with_files
 from swarm.config.vehicle_classes import GROUND, flies
+from swarm.endpoints import host_port, is_loopback
 from swarm.errors import BusError, ConfigError, SwarmError, TerrainError
 from swarm.grid import REGION_CELLS, GridSpec
 from swarm.places import Given, cell_of

@@ -25,11 +25,11 @@ from launch_scripts.report.gis_formats import check_target
 from launch_scripts.typer_commands import command, complete_scenarios, family_app
 from swarm.bus.zenoh_config import ROUTER, bearer, common_name
 from swarm.config import revocations
-from swarm.config.contradictions import check_endpoint
 from swarm.config.input_files import quoted
 from swarm.config.scenario import Scenario
 from swarm.config.scenario_files import anchored
 from swarm.config.setting_types import MOST_PER_AGENT, MOST_TARGETS
+from swarm.endpoints import check_endpoint
 from swarm.errors import ConfigError
 from swarm.files import write_file
 

@@ -14,8 +14,8 @@ from launch_scripts.observe.run_folders import RUNS
 from launch_scripts.process_table import check_name
 from launch_scripts.stop_requests import stop_requests
 from launch_scripts.typer_commands import command, family_app
-from swarm.bus.endpoints import listening
 from swarm.config.scenario import agent_of
+from swarm.endpoints import listening
 from swarm.errors import BusError, ConfigError
 from swarm.places import read_place
 

@@ -220,8 +220,8 @@ def find_swarm(runs: Path | None = None, name: str | None = None) -> list[tuple[
     Raises BusError if no router listens, ConfigError if there is no run of that name.
     """
     from launch_scripts.observe.run_folders import RUNS, KnownRun, find_run, registered
-    from swarm.bus.endpoints import listening
     from swarm.config.scenario import NetworkConfig
+    from swarm.endpoints import listening
 
     if name is not None:
         folder = find_run(name, runs or RUNS)

@@ -22,11 +22,11 @@ from msgspec import Meta
 
 from launch_scripts import process_table
 from launch_scripts.deploy.machines_needed import one_process, swarm_of
-from swarm.config.contradictions import check_endpoint, is_loopback
 from swarm.config.explain import converted
 from swarm.config.input_files import FileKind, parse_toml, read_text
 from swarm.config.scenario import Scenario, StandbyConfig, plan_agents
 from swarm.config.setting_types import Section
+from swarm.endpoints import check_endpoint, is_loopback
 from swarm.errors import ConfigError
 from swarm.peers import HIGHEST_RANK, job_of
 

@@ -29,11 +29,11 @@ from launch_scripts.ports import free_ports
 from launch_scripts.process_table import admitting_all
 from launch_scripts.web import LOOPBACK
 from swarm.bus.bus import Bus, Event, Post
-from swarm.bus.endpoints import host_port, why_not_listening
 from swarm.bus.zenoh_bus import ZenohBus, open_bus
 from swarm.clock import MonotonicClock
 from swarm.config.revocations import with_revocations
 from swarm.config.scenario import NetworkConfig
+from swarm.endpoints import host_port, why_not_listening
 from swarm.errors import BusError, SwarmError
 from swarm.peers import Peer
 from swarm.runtime.inbox import Inbox

@@ -21,13 +21,13 @@ from launch_scripts.ports import free_ports
 from launch_scripts.web import LOOPBACK
 from shared_map.importers.terrain_sources import FILE_KINDS, is_terrain
 from swarm.clock import date_ns
-from swarm.config.contradictions import check_endpoint
 from swarm.config.explain import choice, converted, nearest
 from swarm.config.ground import TerrainConfig
 from swarm.config.input_files import FileKind, check_bytes, quoted
 from swarm.config.scenario import MonitorConfig, NetworkConfig, Scenario, TlsConfig
 from swarm.config.scenario_files import load_scenario
 from swarm.config.vehicle_classes import cost_of_preset
+from swarm.endpoints import check_endpoint
 from swarm.errors import ConfigError, StoreError
 from swarm.files import make_folder, writing
 from swarm.journal import digest_of

@@ -40,10 +40,10 @@ from shared_map.terrain.terrain import Terrain
 from shared_map.terrain.terrain_report import said_of
 from shared_map.vehicle_class_grounds import prepare_classes
 from swarm.bus.bus import Bus
-from swarm.bus.endpoints import listening
 from swarm.bus.zenoh_bus import open_bus
 from swarm.clock import MonotonicClock, date_ns
 from swarm.config.scenario import UNTIL_STOPPED_S
+from swarm.endpoints import listening
 from swarm.errors import BusError, StoreError, SwarmError, require
 from swarm.peers import Peer, job_of
 from swarm.plugins import check_plugins

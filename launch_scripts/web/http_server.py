@@ -20,7 +20,7 @@ from http.server import BaseHTTPRequestHandler
 from typing import Any, NamedTuple, cast
 
 from launch_scripts.web import LOOPBACK, PROBED, Page
-from swarm.config.contradictions import is_loopback
+from swarm.endpoints import is_loopback
 from swarm.errors import BusError
 
 MOST_CONNECTIONS = 24

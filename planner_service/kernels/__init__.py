@@ -2,7 +2,8 @@
 
 `layout` says what the arrays are, `decorators` how kernels are compiled and kept, `climbs` what a step's
 rise does to its cost. Trees are grown by the queues, made exact again by `repair`, `costs_from_parents` and
-`tile_*`, thinned out far from their root by `stride_networks`, and read by `route_kernels` and `lower_bounds`.
+`tile_*`, and thinned out far from their root by `stride_networks`. `partial_growth_kernels` finds how far a growth
+must go, `route_kernels`, `any_angle_kernels` and `lower_bounds` read a tree.
 
 Cells leave a queue in the order of their costs. There is one for each kind of search, as one for all would take 2.5
 to 3 times as long (docs/design/bucket-queues.md, on two shared cores):

@@ -13,7 +13,7 @@ Arrays, beside those of `layout`:
     batch    uint32  (size + AHEAD,) padded cells of the bucket that is being served
     queue    as of `heap_and_buckets`; `make_scratch` says how large
     aim      (lowest, most, boxes)   the lowest cell cost, s; what a cheapest way of an asker costs at most, s; and
-                                     float32 (n, 5), the boxes of `route_kernels.find_aim`. A growth leaves
+                                     float32 (n, 5), the boxes of `partial_growth_kernels.find_aim`. A growth leaves
                                      out the cells over which every way of an asker without a cost costs more, even
                                      at the lowest cost. With `NO_AIM` it leaves out none
     state    int64   (5,)            the last bucket served; entries that wait in the queue; how many of `touched`
@@ -305,8 +305,8 @@ def begin(cost, touched, state, root):
 
 @kernel(f"({layout.GRID}, f4[::1], {layout.BUCKETS}, {_SCRATCH}, i8[::1], {layout.BOX}, f4[:, ::1], i8)")
 def resume(grid, cost, buckets, scratch, state, box, crop, first):
-    """Goes back to a tree that was cut out (see `route_kernels`): to its costs in buckets below `first`, which are
-    exact on the map as it is. Costlier cells are left to `grow_by_buckets`. `cost` is inf and WALL."""
+    """Goes back to a tree that was cut out (see `partial_growth_kernels`): to its costs in buckets below `first`,
+    which are exact on the map as it is. Costlier cells are left to `grow_by_buckets`. `cost` is inf and WALL."""
     cell_cost, _, stride, rule, _ = grid
     width, circle = buckets
     touched, batch, queue = scratch

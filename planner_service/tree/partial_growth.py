@@ -10,7 +10,8 @@ from numpy.typing import NDArray
 
 from planner_service.kernels import queue_dial
 from planner_service.kernels.layout import NONE, TOO_FINE, WALL
-from planner_service.kernels.route_kernels import box_of, find_aim, stays_exact, walk_by_costs
+from planner_service.kernels.partial_growth_kernels import box_of, find_aim, stays_exact
+from planner_service.kernels.route_kernels import walk_by_costs
 from planner_service.tree.cost_changes import Cells, Changes
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.queue_choice import NARROW

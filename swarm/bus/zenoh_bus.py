@@ -40,9 +40,9 @@ from swarm.bus.bus import (
     check_subscription,
     meant_for,
 )
-from swarm.bus.endpoints import keeps_open, wait_for_router, why_not_listening, why_silent
 from swarm.bus.zenoh_config import patterned, session_config
 from swarm.config.scenario import NetworkConfig
+from swarm.endpoints import keeps_open, wait_for_router, why_not_listening, why_silent
 from swarm.errors import BusError, ProtocolError
 from swarm.peers import Peer
 from swarm.wire.access import Authenticator, code_of

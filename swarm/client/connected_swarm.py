@@ -360,9 +360,9 @@ def connect(
     runs share the namespace or the run's wire version is no neighbour of ours.
     """
     from swarm.bus.zenoh_bus import open_bus
-    from swarm.config.contradictions import check_endpoint
     from swarm.config.explain import explain
     from swarm.config.scenario import NetworkConfig, TlsConfig
+    from swarm.endpoints import check_endpoint
     from swarm.runtime.inbox import Inbox
     from swarm.runtime.run_secret import authenticator_of
 

@@ -5,8 +5,6 @@ Each is a sentence with the keys that it rests on, so that it is left out where 
 
 from __future__ import annotations
 
-import ipaddress
-import re
 from collections.abc import Iterator
 from itertools import pairwise
 
@@ -16,6 +14,7 @@ from swarm.config.plugin_names import check_name, plugins_of
 from swarm.config.scenario import Scenario, ids_of
 from swarm.config.setting_types import MOST_TARGETS, RESERVED_GROUPS
 from swarm.config.vehicle_classes import GROUND, SHARED, aloft_classes, factor_at
+from swarm.endpoints import check_endpoint
 from swarm.errors import ConfigError
 from swarm.peers import split_rank
 from swarm.places import read_place
@@ -194,29 +193,3 @@ def _check_zone(zone: ZoneConfig, where: str) -> None:
     for kind, key in _VALUES.items():
         if getattr(zone, key) is not None and zone.kind != kind:
             raise ConfigError(f"{where}: {key} goes with kind {kind}, found {zone.kind!r}")
-
-
-def check_endpoint(endpoint: str, has_tls: bool, where: str) -> None:
-    """Raises ConfigError on an invalid endpoint, and on one beyond loopback without mutual TLS."""
-    match = re.fullmatch(r"(tcp|tls)/(\[[0-9a-fA-F:]+\]|[^:/\[\]]+):(\d{1,5})", endpoint)
-    if match is None:
-        why = ": quic/ is not offered, as strangers could keep members out" if endpoint.startswith("quic/") else ""
-        such = "expected one such as tcp/127.0.0.1:7447 or tls/host:7447"
-        raise ConfigError(f"{where}: {endpoint!r} is not an endpoint{why}; {such}")
-    if int(match[3]) > 65535:
-        raise ConfigError(f"{where}: {endpoint!r} is not an endpoint: a port is at most 65535")
-    protocol, host = match[1], match[2].strip("[]")
-    if protocol == "tls" and not has_tls:
-        raise ConfigError(f"{where}: {endpoint} needs network.tls with ca, certificate and key, or --tls-dir")
-    if protocol == "tcp" and not is_loopback(host):
-        raise ConfigError(
-            f"{where}: {endpoint} leaves this machine in the clear; use tls/{host}:{match[3]} with network.tls"
-        )
-
-
-def is_loopback(host: str) -> bool:
-    """Returns True if a host is this machine by name or address."""
-    try:
-        return ipaddress.ip_address(host).is_loopback
-    except ValueError:
-        return host == "localhost"

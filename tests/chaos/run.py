@@ -29,9 +29,9 @@ from launch_scripts.simulation.world.referee import Referee
 from shared_map.terrain.terrain import build_terrain
 from shared_map.terrain.true_ground import build_truth
 from shared_map.vehicle_class_grounds import class_truths
-from swarm.bus.endpoints import listening
 from swarm.config.scenario import Scenario, plan_agents
 from swarm.config.vehicle_classes import aloft_classes
+from swarm.endpoints import listening
 from swarm.errors import BusError, ConfigError, ProtocolError, StoreError
 from swarm.wire.codec import decode
 from swarm.wire.topics import FLEET

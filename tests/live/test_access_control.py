@@ -23,9 +23,9 @@ from support.zenohd import Zenohd
 from launch_scripts.deploy.certificates import issue
 from launch_scripts.launcher.router import FREE_TRIES, Admission
 from launch_scripts.ports import free_ports
-from swarm.bus.endpoints import host_port
 from swarm.bus.zenoh_config import ROUTER, Bearer, bearer, common_name, patterned, session_config
 from swarm.config.scenario import NetworkConfig, TlsConfig
+from swarm.endpoints import host_port
 from swarm.wire.access import MEMBERS, ROLES
 from swarm.wire.topics import ALIVE_KEY, TOPICS, Topic
 

@@ -14,8 +14,8 @@ from support.live_swarm import SWARM, LiveSwarm, client
 from support.processes import Child, eventually
 
 from swarm.bus.bus import Event, Heard, Replied
-from swarm.bus.endpoints import listening
 from swarm.bus.zenoh_bus import ZenohBus
+from swarm.endpoints import listening
 from swarm.runtime.inbox import Inbox
 from swarm.wire.messages.planning import RouteReply, RouteRequest
 from swarm.wire.messages.processes import Heartbeat, Stats

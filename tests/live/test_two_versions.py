@@ -22,10 +22,10 @@ from support.processes import Child, eventually
 
 from launch_scripts.stop_requests import SAME_S
 from swarm.bus.bus import Event, Heard
-from swarm.bus.endpoints import listening
 from swarm.bus.zenoh_bus import ZenohBus
 from swarm.config.scenario import NetworkConfig
 from swarm.config.scenario_files import load_scenario
+from swarm.endpoints import listening
 from swarm.wire.messages.processes import Stats
 from swarm.wire.messages.vehicles import Fleet, VehicleState
 from swarm.wire.topics import FLEET, STATS

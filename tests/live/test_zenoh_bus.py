@@ -32,10 +32,10 @@ from docs.generate.wire_page import JSON_PATH as WIRE_PAGE
 from docs.generate.wire_page import example, key_fields, put_from_outside
 from launch_scripts.ports import free_ports
 from swarm.bus.bus import Appeared, Asked, AskEnded, Disappeared, Heard, LinkChanged, Replied, meant_for
-from swarm.bus.endpoints import host_port
 from swarm.bus.zenoh_bus import ZenohBus, open_bus
 from swarm.clock import MonotonicClock
 from swarm.config.scenario import NetworkConfig
+from swarm.endpoints import host_port
 from swarm.errors import BusError
 from swarm.peers import Peer
 from swarm.runtime.inbox import Inbox

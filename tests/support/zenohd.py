@@ -11,8 +11,8 @@ import pytest
 from support.processes import Child, eventually
 
 from launch_scripts.deploy.machine_archives import zenohd_config
-from swarm.bus.endpoints import listening
 from swarm.config.scenario import NetworkConfig
+from swarm.endpoints import listening
 
 PLUGIN = "libzenoh_plugin_storage_manager.so"
 

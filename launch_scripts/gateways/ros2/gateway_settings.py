@@ -19,11 +19,11 @@ from msgspec import Meta
 from launch_scripts.gateways.ros2.rmw import Qos
 from launch_scripts.gateways.ros2.ros_messages import TERRAIN_FRAME, ros_name
 from launch_scripts.gateways.ros2.ros_types import Distribution
-from swarm.config.contradictions import is_loopback
 from swarm.config.explain import choice, converted
 from swarm.config.input_files import FileKind, parse_toml, read_text
 from swarm.config.scenario_files import with_settings
 from swarm.config.setting_types import Metres, Name, Positive, Section
+from swarm.endpoints import is_loopback
 from swarm.errors import ConfigError
 from swarm.wire.messages.planning import GROUND
 from swarm.wire.messages.vehicles import LONGEST_OBSTACLE_LEASE_S, MOST_RADIUS_M

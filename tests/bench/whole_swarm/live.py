@@ -22,10 +22,10 @@ from launch_scripts.launcher.takeover import processes
 from launch_scripts.ports import free_ports
 from launch_scripts.process_table import processes_of
 from swarm.bus.bus import Heard
-from swarm.bus.endpoints import listening
 from swarm.bus.zenoh_bus import ZenohBus, open_bus
 from swarm.config.scenario import NetworkConfig, Scenario
 from swarm.config.scenario_files import parse_scenario
+from swarm.endpoints import listening
 from swarm.errors import BusError
 from swarm.runtime.inbox import Inbox
 from swarm.wire.fields import column

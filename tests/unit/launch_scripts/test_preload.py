@@ -19,7 +19,7 @@ from launch_scripts.simulation import simulate
 simulate.build_truth = lambda scenario, terrain: terrain.pace_s_per_m
 # A live run has both of them prepared, and imports nothing to find them.
 from launch_scripts.simulation.sample_worlds import crowd
-from swarm.bus.endpoints import listening
+from swarm.endpoints import listening
 
 from launch_scripts.simulation.world.walks import WAY_MODULES
 from shared_map.keeper.zone_orders import ZONE_MODULES

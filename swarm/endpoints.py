@@ -1,4 +1,4 @@
-"""Endpoints of routers: their parts, whether a process listens there, and if none does, the reason.
+"""Endpoints of routers: which are valid, whether a process listens there, and if none does, the reason.
 
 The reasons are in words of our own: the network library names its own source files instead.
 """
@@ -6,12 +6,15 @@ The reasons are in words of our own: the network library names its own source fi
 from __future__ import annotations
 
 import errno
+import ipaddress
 import logging
 import os
 import re
 import socket
 import time
 from collections.abc import Sequence
+
+from swarm.errors import ConfigError
 
 log = logging.getLogger(__name__)
 
@@ -32,6 +35,32 @@ def host_port(endpoint: str) -> tuple[str, int]:
     """Host and port of an endpoint such as tcp/[::1]:7447."""
     host, _, port = endpoint.partition("/")[2].rpartition(":")
     return host.strip("[]"), int(port)
+
+
+def check_endpoint(endpoint: str, has_tls: bool, where: str) -> None:
+    """Raises ConfigError on an invalid endpoint, and on one beyond loopback without mutual TLS."""
+    match = re.fullmatch(r"(tcp|tls)/(\[[0-9a-fA-F:]+\]|[^:/\[\]]+):(\d{1,5})", endpoint)
+    if match is None:
+        why = ": quic/ is not offered, as strangers could keep members out" if endpoint.startswith("quic/") else ""
+        such = "expected one such as tcp/127.0.0.1:7447 or tls/host:7447"
+        raise ConfigError(f"{where}: {endpoint!r} is not an endpoint{why}; {such}")
+    if int(match[3]) > 65535:
+        raise ConfigError(f"{where}: {endpoint!r} is not an endpoint: a port is at most 65535")
+    protocol, host = match[1], match[2].strip("[]")
+    if protocol == "tls" and not has_tls:
+        raise ConfigError(f"{where}: {endpoint} needs network.tls with ca, certificate and key, or --tls-dir")
+    if protocol == "tcp" and not is_loopback(host):
+        raise ConfigError(
+            f"{where}: {endpoint} leaves this machine in the clear; use tls/{host}:{match[3]} with network.tls"
+        )
+
+
+def is_loopback(host: str) -> bool:
+    """Returns True if a host is this machine by name or address."""
+    try:
+        return ipaddress.ip_address(host).is_loopback
+    except ValueError:
+        return host == "localhost"
 
 
 def listening(endpoint: str) -> bool:
