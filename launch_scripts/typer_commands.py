@@ -80,7 +80,15 @@ def command(
 
 
 class Command(TyperCommand):
-    """A command whose help has short types."""
+    """A command whose help has short types, and which takes no option twice that has one value: the last would
+    win without a word."""
+
+    def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        given: list[Any] = self.make_parser(ctx).parse_args(args=list(args))[2]
+        once = [each for each in given if each.param_type_name == "option" and not (each.multiple or each.is_flag)]
+        if twice := next((each for each in once if once.count(each) > 1), None):
+            raise ConfigError(f"{twice.opts[0]} is given {once.count(twice)} times, and takes one value")
+        return super().parse_args(ctx, args)
 
     def format_help(self, ctx: Any, formatter: Any) -> None:
         TyperCommand.format_help(with_short_types(self, ctx), ctx, formatter)

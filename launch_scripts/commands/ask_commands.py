@@ -90,7 +90,12 @@ def route(
 
 
 @command(app, ASK)
-def status(where: shared_options.Where, watch: bool = False, as_json: shared_options.AsJson = False) -> None:
+def status(
+    where: shared_options.Where,
+    watch: bool = False,
+    vehicles: bool = False,
+    as_json: shared_options.AsJson = False,
+) -> None:
     """Show a running swarm: metrics, processes, targets and alarms.
 
     Without --connect it asks the newest active run of this machine, whatever its ports.
@@ -99,13 +104,22 @@ def status(where: shared_options.Where, watch: bool = False, as_json: shared_opt
 
     swarm status --json | jq .planners
 
-    watch  Show processes once a second, as `swarm top`.
+    swarm status --vehicles | grep stranded
+
+    watch     Show processes once a second, as `swarm top`.
+    vehicles  Show each vehicle instead: its class, its state, where it drives to, and its place.
     """
-    from launch_scripts.commands.status_view import ask_status, print_status, status_fields
+    from launch_scripts.commands.status_view import ask_status, print_status, status_fields, vehicles_table
     from launch_scripts.launcher.console import whole_output
 
+    if watch and vehicles:
+        raise ConfigError("--watch shows processes, --vehicles shows vehicles: give one of them")
     if watch:
         top(where, as_json=as_json)
+    elif vehicles and as_json:
+        typer.echo(json.dumps({"vehicles": ask_status(where).vehicles()}, indent=2))
+    elif vehicles:
+        whole_output().print(vehicles_table(ask_status(where)))
     elif as_json:
         typer.echo(json.dumps(status_fields(ask_status(where)), indent=2))
     else:

@@ -32,6 +32,7 @@ from swarm.places import extent_of, fields_of, written
 from swarm.wire.messages.orders import GoalState
 from swarm.wire.messages.planning import PlannerStatus
 from swarm.wire.messages.processes import RunInfo
+from swarm.wire.messages.vehicles import VehicleState
 
 if TYPE_CHECKING:
     from launch_scripts.commands.shared_options import Where
@@ -79,6 +80,37 @@ class Status:
     @property
     def state(self) -> RunState:
         return state_of(self.latest, self.now_ns)
+
+    def vehicles(self) -> list[dict[str, Any]]:
+        """A row for each vehicle at its last reported place; external ones come last.
+
+        to  the cell that it was sent to, or the target that it chases
+        at  its cell, in all coordinates that the terrain has; None outside the terrain
+        """
+        latest, frame = self.latest, self.frame
+        driven = latest.driven(latest.plan.crew_now(latest.plan.targets_now(latest.book)), self.now_ns)
+        classes, sent = latest.classes(), {goal.name: goal.cell for goal in latest.goals()}
+        if frame is None:
+            return []
+
+        def row(id: str, x_m: float, y_m: float, **more: Any) -> dict[str, Any]:
+            cell = frame.grid.cell_at(x_m, y_m)
+            goal = sent.get(id)
+            to = {} if goal is None or goal >= frame.grid.cells else {"to": fields_of(frame, goal)}
+            return {"id": id, **more, **to, "at": None if cell < 0 else fields_of(frame, cell)}
+
+        places = zip(driven.ids, driven.east_m.tolist(), driven.south_m.tolist(), strict=True)
+        own = [
+            row(
+                id, frame.grid.west_m + east_m, frame.grid.north_m - south_m,
+                vehicle_class=classes[id], state=VehicleState(state).name.lower(),
+                to=None if target < 0 else driven.target_ids[target],
+            )
+            for (id, east_m, south_m), state, target in zip(places, driven.states, driven.targets, strict=True)
+        ]  # fmt: skip
+        external = {"vehicle_class": None, "state": "external", "to": None}
+        outside = latest.external(self.now_ns).items()
+        return own + [row(id, each.x_m, each.y_m, **external) for id, each in outside]
 
 
 def observed(
@@ -179,6 +211,18 @@ def _processes(status: Status) -> Table:
         pid = str(status.pids.get(name, "-"))
         crew.add_row(f"{name}{leading}", pid, facts.seconds(up_s), *(facts.count(n) for n in told))
     return crew
+
+
+def vehicles_table(status: Status) -> Table:
+    """The vehicles of a run, for people."""
+
+    def place(at: Any) -> str:
+        return f"cell:{at['row']},{at['col']}" if isinstance(at, dict) else str(at or "-")
+
+    shown = terminal.columns("vehicle", "class", "state", "to", "at")
+    for each in status.vehicles():
+        shown.add_row(each["id"], each["vehicle_class"] or "-", each["state"], place(each["to"]), place(each["at"]))
+    return shown
 
 
 def status_fields(status: Status) -> dict[str, Any]:

@@ -10,7 +10,7 @@ from support.client_rig import keeper_info
 from support.swarm_model import SwarmModel
 from support.target_reports import fleet
 
-from launch_scripts.commands.status_view import Status, print_status, status_fields, status_of
+from launch_scripts.commands.status_view import Status, print_status, status_fields, status_of, vehicles_table
 from launch_scripts.observe.run_observer import OutsideObserver, RunObserver
 from swarm.bus.bus import Appeared, AskEnded, Disappeared, Heard, Replied
 from swarm.clock import NS_PER_S
@@ -143,6 +143,29 @@ def test_vehicles_that_were_sent_somewhere_are_shown_with_their_state_and_those_
     assert "external vehicles away, rover" in text
     assert "rover is at cell:1,2 (xy:225,-135)" in text
     assert "away is at" not in text
+
+
+def test_each_vehicle_has_a_row_with_where_it_is_and_where_it_drives_to() -> None:
+    status = told_by(a0=9)
+    status.latest.heard(fleet(100.0, ("a0-00", 1), ("a0-01", 2)), 0)
+    sent = GoalState(name="a0-01", stamp_ns=1, done=0, state="underway", cell=7)
+    status.latest.heard(GoalStates(agent="a0", stamp_ns=1, states=[sent]), 0)
+    for id, x_m in (("away", -1e6), ("rover", 225.0)):
+        status.latest.heard(Obstacle(id=id, incarnation=1, seq=1, x_m=x_m, y_m=-135.0, radius_m=1.0), 0)
+    rows = {row.pop("id"): row for row in status.vehicles()}
+    assert list(rows) == ["a0-00", "a0-01", "away", "rover"]
+    assert rows["a0-01"]["to"] == {"row": 1, "col": 2, "x_m": 225.0, "y_m": -135.0}
+    assert rows["a0-00"]["at"]["row"] == 0
+    assert rows["away"]["at"] is None
+    assert rows["rover"] == {
+        "vehicle_class": None, "state": "external", "to": None,
+        "at": {"row": 1, "col": 2, "x_m": 225.0, "y_m": -135.0},
+    }  # fmt: skip
+    console = Console(file=io.StringIO(), width=100)
+    console.print(vehicles_table(status))
+    lines = {line.split()[0]: line.split()[1:] for line in console.file.getvalue().splitlines()}  # type: ignore[attr-defined]
+    assert lines["a0-01"][2:] == ["cell:1,2", f"cell:0,{rows['a0-01']['at']['col']}"]
+    assert lines["away"] == ["-", "external", "-", "-"]
 
 
 def test_an_upgrade_under_way_is_shown_with_those_that_speak_the_older_version() -> None:
