@@ -195,7 +195,10 @@ def give(where: Where, as_json: bool, *orders: dict[str, Any], at: str | None = 
     ]  # fmt: skip
     silent = 0
     printed: list[dict[str, Any]] = []
-    with where.operators_bus() as (bus, _):
+    with where.operators_bus() as (bus, found):
+        sent = any(isinstance(order, SendVehicle) and not order.off for order in made)
+        if sent and not any(name.startswith("places-") for info in found for name in info.crew):
+            raise ConfigError(where.plans_no_places)
         for order in made:
             said: dict[str, Any] = {}
             if isinstance(order, GiveOrder) and place is not None:

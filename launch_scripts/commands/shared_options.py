@@ -199,6 +199,11 @@ class Where(Tls):
             bus.trust(authenticator_of(network, run_of_most(found)[0]))
             yield bus, found
 
+    @property
+    def plans_no_places(self) -> str:
+        """The sentence about a run that plans to its targets alone."""
+        return f"no process plans routes to places {self}: its scenario needs planner.places = true"
+
     def __str__(self) -> str:
         endpoint = self.connect or ", ".join(self._found.connect)
         return f"in namespace {(self.namespace or self._found.namespace)!r} at {endpoint}"

@@ -220,6 +220,8 @@ def vehicles_table(status: Status) -> Table:
         return f"cell:{at['row']},{at['col']}" if isinstance(at, dict) else str(at or "-")
 
     shown = terminal.columns("vehicle", "class", "state", "to", "at")
+    for column in shown.columns:
+        column.justify = "left"
     for each in status.vehicles():
         shown.add_row(each["id"], each["vehicle_class"] or "-", each["state"], place(each["to"]), place(each["at"]))
     return shown

@@ -30,6 +30,7 @@ from swarm.wire.route_columns import Route, RouteStatus, TargetStatus
 from swarm.wire.topics import PLACE_ROUTE, ROUTE, Topic, asker_of
 
 if TYPE_CHECKING:
+    from launch_scripts.commands.shared_options import Where
     from swarm.bus.bus import Bus
 
 M = TypeVar("M", bound=Message)
@@ -109,15 +110,14 @@ def ask_planner(bus: Bus, where: object, target: str, start: Place, vehicle_clas
     return Answer(reply, frame, cell, (time.monotonic() - began_s) * 1e3)
 
 
-def ask_place(bus: Bus, where: object, start: Place, end: Place, vehicle_class: str) -> Answer:
+def ask_place(bus: Bus, where: Where, start: Place, end: Place, vehicle_class: str) -> Answer:
     """Asks for the route between two places, until it is known. Raises BusError or ConfigError in one sentence."""
     frame = frame_of_run(bus, where)
     cell, goal = cell_of(start, frame, "--from"), cell_of(end, frame, "--to")
     request = PlaceRouteRequest(to=goal, cells=[cell], vehicle_class=vehicle_class)
-    missing = f"no process plans routes to places {where}: its scenario needs planner.places = true"
     began_s = time.monotonic()
     while True:
-        found = _reply(bus, PLACE_ROUTE, request, PlaceRouteReply, "places-*", missing)
+        found = _reply(bus, PLACE_ROUTE, request, PlaceRouteReply, "places-*", where.plans_no_places)
         spent_s = time.monotonic() - began_s
         if found.status != "growing" or spent_s > _TIMEOUT_S:
             break

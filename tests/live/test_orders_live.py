@@ -201,6 +201,7 @@ def test_a_hundred_targets_of_a_stranger_start_nothing(live: LiveSwarm, session:
         (("zone", "add", "--polygon", "0,0 5,5 0,5 5,0"), "cross"),
         (("set", "seed", "4"), "cannot change while the swarm runs"),
         (("set", "time_scale", "-3"), "-3.0 is not in 0.001 ... 1000"),
+        (("vehicle", "send", "a0-01", "cell:5,5"), "needs planner.places = true"),
     ],
 )
 def test_a_bad_order_gets_a_sentence(live: LiveSwarm, words: tuple[str, ...], says: str) -> None:
