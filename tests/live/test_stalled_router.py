@@ -127,7 +127,8 @@ def stalled(router: Router, stalls: int, patch: pytest.MonkeyPatch) -> list[List
 
 def test_of_what_a_stalled_router_delivers_under_wrong_keys_none_is_believed(router, monkeypatch):
     listeners = stalled(router, STALLS, monkeypatch)
-    assert sum(len(each.right) for each in listeners) > 1000
+    # Some ten thousand on an idle machine; a busy one drops nearly all at the lease.
+    assert sum(len(each.right) for each in listeners) >= STALLS
     for each in listeners:
         counts = each.bus.counts
         assert counts["payloads_misrouted"] == len(each.wrong)
