@@ -76,6 +76,8 @@ class _Question:
     asked_ns: int
     found: list[Route] = field(default_factory=list)
     lethal_goal: bool = False
+    nearest: int | None = None
+    """The open cell nearest to a lethal goal."""
     rank: int = 0
     """Those of a lower one come first: of agents before those of others."""
     version: int = -1
@@ -182,6 +184,7 @@ class _ClassTrees:
             walked += 1 + len(answer.route.directions)
             question.found.append(answer.route)
             question.lethal_goal = answer.lethal_goal
+            question.nearest = self.trees.costs.nearest_open(request.to) if answer.lethal_goal else None
         return grown
 
     def status(self, question: _Question) -> PlaceStatus:
@@ -363,6 +366,7 @@ class PlacesService(PlanningProcess):
             routes=routes.columns(),
             status=trees.status(question),
             vehicle_class=request.vehicle_class,
+            nearest_cell=question.nearest,
         )
         event.answer(reply, places=self._job)
         event.end()

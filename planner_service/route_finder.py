@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import reprlib
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -16,10 +15,10 @@ from planner_service.strategy import STRATEGIES
 from planner_service.target_tree import TargetTree
 from planner_service.tree.cost_grid import CostGrid
 from shared_map.terrain.slope_and_climb import Climb
-from swarm.config.explain import choice, converted, nearest
+from swarm.config.explain import check_keywords, choice, converted
 from swarm.config.scenario import PlannerConfig
-from swarm.errors import ConfigError
-from swarm.grid import GridSpec, Window, real, walk, whole
+from swarm.errors import ArgumentError
+from swarm.grid import GridSpec, Window, real, shown, walk, whole
 from swarm.wire.route_columns import Route, RouteStatus, TargetStatus, directions_of
 
 _KEPT_BYTES = 1 << 28
@@ -89,13 +88,12 @@ class RouteFinder:
 
     Raises
     ------
-    ValueError
-        On a pace that is NaN, zero or negative, masked or true, an array without two dimensions, or an unknown
-        strategy.
-    TypeError
-        On a row or column that is no whole number, a resolution that is none, or a climb of another type.
     ConfigError
         On a setting that does not exist, or may not have this value.
+    ArgumentError
+        A ConfigError, ValueError and TypeError: on a pace that is NaN, zero or negative, masked or true, an array
+        without two dimensions, an unknown strategy, a row or column that is no whole number, a resolution that is
+        none, or a climb of another type.
     """
 
     def __init__(
@@ -109,17 +107,15 @@ class RouteFinder:
     ) -> None:
         self._pace = _paces(pace)
         if self._pace.ndim != 2:
-            raise ValueError(f"pace has {self._pace.ndim} dimensions, expected 2")
+            raise ArgumentError(f"pace has {self._pace.ndim} dimensions, expected 2")
         rows, cols = self._pace.shape
         self.grid = GridSpec(rows, cols, real("resolution_m", resolution_m))
         _check_type("climb", climb, Climb | None)
         own = (*PlannerConfig.__struct_encode_fields__, "target", "resolution_m", "climb")
-        for key in settings.keys() - {*own}:
-            if near := nearest(key, own):
-                raise ConfigError(f"RouteFinder: unknown key {key}{near}")
+        check_keywords(settings, own, "RouteFinder")
         self._config = converted({"strategy": "full", **settings}, PlannerConfig, "RouteFinder", "settings")
         if (strategy := self._config.strategy) not in STRATEGIES:
-            raise ValueError(f"strategy: found {strategy!r}{choice(strategy, tuple(STRATEGIES))}")
+            raise ArgumentError(f"strategy: found {strategy!r}{choice(strategy, tuple(STRATEGIES))}")
         self._climb = climb
         self._tree = TargetTree(self.grid, self._config, climb)
         self._goals: GoalTrees | None = None
@@ -135,14 +131,14 @@ class RouteFinder:
     def change(self, pace: Any, row: int = 0, col: int = 0) -> None:
         """Replaces paces: `pace` is a (height, width) block in s/m, whose north-west cell is (row, col).
 
-        Raises ValueError, and changes nothing, on a block that leaves the grid or a pace that is not positive.
+        Raises ArgumentError, and changes nothing, on a block that leaves the grid or a pace that is not positive.
         """
         row, col = _whole((row, col))
         block = np.atleast_2d(_paces(pace))
         window = Window(row, col, row + block.shape[0], col + block.shape[1])
         if block.ndim != 2 or row < 0 or col < 0 or window.row1 > self.grid.rows or window.col1 > self.grid.cols:
             place = f"rows {row} to {window.row1 - 1} and columns {col} to {window.col1 - 1}"
-            raise ValueError(f"{place} are not inside {self.grid.rows} x {self.grid.cols} cells")
+            raise ArgumentError(f"{place} are not inside {self.grid.rows} x {self.grid.cols} cells")
         self._pace[row : window.row1, col : window.col1] = block
         self._version += 1
         if self._goals is not None:
@@ -151,7 +147,7 @@ class RouteFinder:
 
     def route(self, row: int, col: int | None = None) -> FoundRoute:
         """The cheapest route that is known from a cell, with its proven lower bound. Outside is a status. Raises
-        TypeError unless both are whole numbers."""
+        ArgumentError unless both are whole numbers."""
         row, col = _whole((row, col))
         cell = self.grid.cell(row, col) if self.grid.inside(row, col) else -1
         found: Route = self._tree.routes([cell])[0]
@@ -193,17 +189,17 @@ class RouteFinder:
         The cheapest chain of segments between the route's own cells, by dynamic programming over some of them:
         those up to 64 cells back, with growing gaps, and the turn before.
 
-        Raises ValueError where uphill is not downhill on the ground, on a route that does not lead to a target, and
-        on one that the map's changes have shut; TypeError on anything else.
+        Raises ArgumentError where uphill is not downhill on the ground, on a route that does not lead to a target,
+        on one that the map's changes have shut, and on anything else.
         """
         _check_type("route", route, FoundRoute)
         if route.status is not RouteStatus.OK:
-            raise ValueError(f"route is {route.status.value!r}, expected 'ok': no other is pulled")
+            raise ArgumentError(f"route is {route.status.value!r}, expected 'ok': no other is pulled")
         at = route.cells @ np.array((self.grid.cols, 1), np.int64)
         codes = np.frombuffer(bytearray(directions_of(at, self.grid.cols)), np.uint8)
         pulled, prices = self._puller.pull(at[:1], codes, np.array([codes.size]))
         if not np.isfinite(prices[0, 0]):
-            raise ValueError("the route passes a cell or a corner that is shut by now: ask for it again")
+            raise ArgumentError("the route passes a cell or a corner that is shut by now: ask for it again")
         crossed = np.array(walk(self.grid, int(at[0]), pulled.directions.tobytes()))
         turned = np.concatenate(((0,), np.cumsum(pulled.legs, dtype=np.int64)))
         turns = np.stack(np.divmod(crossed[turned], self.grid.cols), axis=1)
@@ -231,29 +227,33 @@ class RouteFinder:
 
 
 def _check_type(name: str, value: object, kind: Any) -> None:
-    """Raises TypeError unless a value is of this type."""
+    """Raises ArgumentError unless a value is of this type."""
     if not isinstance(value, kind):
-        raise TypeError(f"{name} is {reprlib.repr(value)}, expected {getattr(kind, '__name__', kind)}")
+        raise ArgumentError(f"{name} is {shown(value)}, expected {getattr(kind, '__name__', kind)}")
 
 
 def _whole(place: Any) -> tuple[int, int]:
-    """A place as a cell. Raises TypeError if row or column is not whole, as half a row may be half a map away, or
-    has more than 64 bits."""
+    """A place as a cell. Raises ArgumentError if row or column is not whole, as half a row may be half a map away,
+    or has more than 64 bits."""
     try:
-        row, col = map(int, np.array([whole(each) for each in place], np.int64))
+        row, col = map(int, np.array([whole("row or column", each) for each in place], np.int64))
     except (TypeError, ValueError, OverflowError) as error:
-        raise TypeError(f"{place!r} is no cell, which is two whole numbers, such as 1, 1") from error
+        raise ArgumentError(f"{shown(place)} is no cell, which is two whole numbers, such as 1, 1") from error
     return row, col
 
 
 def _paces(given: Any) -> NDArray[np.float32]:
-    """A copy of paces. Raises ValueError where one is no number above 0; what float32 makes inf is not lethal."""
+    """A copy of paces. Raises ArgumentError where one is no number above 0; what only float32 makes inf is none."""
     values = np.asanyarray(given)
     if values.dtype.kind not in "iuf" or np.ma.is_masked(values):
-        raise ValueError(f"pace is {values.dtype}, or masked in part; expected numbers, and inf where it is lethal")
+        raise ArgumentError(
+            f"pace is {values.dtype}, or masked in part; expected numbers, and inf where it is lethal"
+        )
     with np.errstate(over="ignore"):
         paces = np.array(values, np.float32, order="C")
     wrong = ~(paces > 0) | (np.isinf(paces) & np.isfinite(values))
     if wrong.any():
-        raise ValueError(f"a pace is {values[wrong][0]:g} s/m, expected 1e-38 to 3e+38, or inf where it is lethal")
+        raise ArgumentError(
+            f"a pace is {values[wrong][0]:g} s/m, expected 1e-38 to 3e+38, or inf where it is lethal"
+        )
     return paces

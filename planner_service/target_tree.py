@@ -68,10 +68,6 @@ class Update:
         return Update("window", window, cells, self.wants_full, repaired.repair_ns)
 
 
-_NEAR_CELLS = 256
-"""Rows and columns about a target within which the nearest open cell is looked for: some milliseconds."""
-
-
 class LethalTarget(NamedTuple):
     """A target's lethal cell, to which no tree leads, and the nearest cell that can be reached; None if none is
     near."""
@@ -365,22 +361,9 @@ class TargetTree:
         It looks at a circle that holds the last answer, and at wider ones if no tree leads from there any more, so
         that a target which moves over water costs what lies between it and the shore.
         """
-        row, col = self._grid.row_col(target_cell)
         last = None if self.lethal_target is None else self.lethal_target.nearest
         first = 1 if last is None else self._grid.distance_cells(target_cell, last) * 3 // 2 + 1
-        costs = self.cost_grid.cell_cost.reshape(-1, self.cost_grid.stride)[1:-1, 1:-1]
-        for half in (*(first << n for n in range(8) if first << n < _NEAR_CELLS), _NEAR_CELLS):
-            window = self._grid.around(target_cell, half)
-            rows, cols = np.nonzero(costs[window.row0 : window.row1, window.col0 : window.col1] < np.inf)
-            rows, cols = rows + window.row0, cols + window.col0
-            away = (rows - row) ** 2 + (cols - col) ** 2
-            near = np.flatnonzero((away <= half**2) | (half == _NEAR_CELLS))
-            led = near[self._leads((rows[near] + 1) * self.cost_grid.stride + cols[near] + 1)]
-            chosen = led if led.size or half < _NEAR_CELLS else near
-            if chosen.size:
-                best = int(chosen[away[chosen].argmin()])
-                return self._grid.cell(int(rows[best]), int(cols[best]))
-        return None
+        return self.cost_grid.nearest_open(target_cell, first, self._leads)
 
     def _follow(self, target_cell: int, changes: Changes | None) -> Update:
         """Brings the tree up to date with the map, then with its target: decide, and do it."""

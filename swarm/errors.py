@@ -43,6 +43,10 @@ class ConfigError(SwarmError):
     exit_code = 2
 
 
+class ArgumentError(ConfigError, ValueError, TypeError):
+    """An argument of a call from Python that is not what it must be; also one of Python's own errors for that."""
+
+
 class TerrainError(SwarmError):
     """A terrain or photo that cannot be read, or on which every cell is lethal."""
 
@@ -82,5 +86,5 @@ class ProtocolError(SwarmError):
     sees it."""
 
 
-class OutsideGridError(ValueError):
-    """A cell outside the grid where one inside it is required: a bug, not a fault of the input."""
+class OutsideGridError(ArgumentError):
+    """A cell outside the grid where one inside it is required."""

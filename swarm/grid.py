@@ -16,7 +16,7 @@ from functools import lru_cache
 from itertools import accumulate
 from typing import Any
 
-from swarm.errors import OutsideGridError
+from swarm.errors import ArgumentError, OutsideGridError
 
 TILE_CELLS = 32
 """Side of a tile, in cells. The marks of one author on one tile travel as one message."""
@@ -33,21 +33,36 @@ MAX_CELLS = 16384 * 16384
 """A larger grid is refused wherever one comes from outside."""
 
 
-def whole(value: Any) -> int:
-    """A whole number, also of NumPy's. Raises TypeError on anything else, such as 2.0, and on True, which Python
-    takes for 1."""
-    if isinstance(value, bool):
-        raise TypeError(f"{value} is no whole number")
-    return operator.index(value)
+def shown(value: Any) -> str:
+    """A value for a sentence: short, and in one line."""
+    return " ".join(reprlib.repr(value).split())
 
 
-def real(name: str, value: Any) -> float:
-    """A number as a float, also of NumPy's. Raises TypeError on anything else, such as text, and on True; `name` is
-    that of the value."""
-    if not isinstance(value, str | bytes | bool) and str(getattr(value, "dtype", "")) != "bool":
+def whole(name: str, value: Any) -> int:
+    """A whole number, also of NumPy's. Raises ArgumentError on anything else, such as 2.0 and True; Python takes
+    that for 1. `name` is that of the value."""
+    if not isinstance(value, bool):
+        with suppress(TypeError):
+            return operator.index(value)
+    raise ArgumentError(f"{name} is {shown(value)}, expected a whole number")
+
+
+def real(name: str, value: Any, least: float = -math.inf, most: float = math.inf, *, more: bool = False) -> float:
+    """A number as a float, also of NumPy's. Raises ArgumentError on anything else, such as text, and beyond bounds.
+
+    name  that of the value
+    more  the value must exceed `least`
+    """
+    if not isinstance(value, str | bytes | bool) and getattr(getattr(value, "dtype", None), "kind", "f") in "iuf":
+        found = None
         with suppress(TypeError, ValueError, OverflowError):
-            return float(value)
-    raise TypeError(f"{name} is {reprlib.repr(value)}, expected a number")
+            found = float(value)
+        if found is not None:
+            if (least, most) == (-math.inf, math.inf) or (least <= found <= most and not (more and found == least)):
+                return found
+            bounds = f"more than {least:g} and at most {most:g}" if more else f"{least:.4g} ... {most:g}"
+            raise ArgumentError(f"{name} is {found!r}, expected {bounds}")
+    raise ArgumentError(f"{name} is {shown(value)}, expected a number")
 
 
 STEP_ROW = (-1, -1, 0, 1, 1, 1, 0, -1)
@@ -108,7 +123,7 @@ class GridSpec:
     west_m, north_m  outer corner of cell (0, 0) in the frame of `crs`
     crs              coordinate system, such as "EPSG:32632"; "local" is metres from anywhere
 
-    Raises ValueError on a shape or resolution that no grid has, TypeError on what is no number. A cell is whole
+    Raises ArgumentError on a shape or resolution that no grid has, and on what is no number. A cell is whole
     numbers: half a row would be half the map's width away.
     """
 
@@ -120,12 +135,12 @@ class GridSpec:
     crs: str = "local"
 
     def __post_init__(self) -> None:
-        if whole(self.rows) < 1 or whole(self.cols) < 1:
-            raise ValueError(f"a grid needs at least one cell, not {self.rows} x {self.cols}")
+        if whole("rows", self.rows) < 1 or whole("cols", self.cols) < 1:
+            raise ArgumentError(f"a grid needs at least one cell, not {self.rows} x {self.cols}")
         if self.rows * self.cols > MAX_CELLS:
-            raise ValueError(f"{self.rows} x {self.cols} cells are more than {MAX_CELLS}")
+            raise ArgumentError(f"{self.rows} x {self.cols} cells are more than {MAX_CELLS}")
         if not 0 < real("resolution_m", self.resolution_m) < math.inf:
-            raise ValueError(f"resolution_m must be a positive number, not {self.resolution_m}")
+            raise ArgumentError(f"resolution_m must be a positive number, not {self.resolution_m}")
 
     @property
     def shape(self) -> tuple[int, int]:
@@ -166,15 +181,15 @@ class GridSpec:
         return 0 <= row < self.rows and 0 <= col < self.cols
 
     def cell(self, row: int, col: int) -> int:
-        """Flat index of (row, col). Raises OutsideGridError outside the grid, TypeError between cells."""
-        row, col = whole(row), whole(col)
+        """Flat index of (row, col). Raises OutsideGridError outside the grid, ArgumentError between cells."""
+        row, col = whole("row", row), whole("col", col)
         if not self.inside(row, col):
             raise OutsideGridError(f"row {row}, col {col} is not in {self.rows} x {self.cols}")
         return row * self.cols + col
 
     def row_col(self, cell: int) -> tuple[int, int]:
-        """(row, col) of a flat index. Raises OutsideGridError outside the grid, TypeError between cells."""
-        if not 0 <= whole(cell) < self.cells:
+        """(row, col) of a flat index. Raises OutsideGridError outside the grid, ArgumentError between cells."""
+        if not 0 <= whole("cell", cell) < self.cells:
             raise OutsideGridError(f"cell {cell} is not in {self.rows} x {self.cols}")
         return divmod(cell, self.cols)
 
@@ -184,9 +199,12 @@ class GridSpec:
         return self.west_m + (col + 0.5) * self.resolution_m, self.north_m - (row + 0.5) * self.resolution_m
 
     def cell_at(self, x_m: float, y_m: float) -> int:
-        """The cell that holds a place, -1 outside the grid."""
-        row = math.floor((self.north_m - y_m) / self.resolution_m)
-        col = math.floor((x_m - self.west_m) / self.resolution_m)
+        """The cell that holds a place, -1 outside the grid. Raises ArgumentError on what is no place."""
+        try:
+            row = math.floor((self.north_m - real("y_m", y_m)) / self.resolution_m)
+            col = math.floor((real("x_m", x_m) - self.west_m) / self.resolution_m)
+        except (ValueError, OverflowError) as error:
+            raise ArgumentError(f"x_m {shown(x_m)}, y_m {shown(y_m)} is no place") from error
         return row * self.cols + col if self.inside(row, col) else -1
 
     def tile_of(self, cell: int) -> int:

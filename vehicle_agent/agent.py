@@ -521,8 +521,15 @@ class Agent:
             else:
                 begun += self._take(vehicle, asked.target, route, now_ns, pushed=False)
                 if isinstance(reply, PlaceRouteReply) and reply.status in REASONS:
-                    self.goals.refused[id] = reply.status
+                    self.goals.refused[id] = self._why(reply)
         return begun
+
+    def _why(self, reply: PlaceRouteReply) -> str:
+        """Why no route leads to a place, or the status which says that."""
+        near, grid = reply.nearest_cell, self._map.grid
+        if near is None or near >= grid.cells:
+            return reply.status
+        return "{}; the nearest open cell is cell:{},{}".format(REASONS[reply.status], *grid.row_col(near))
 
     def routes_ended(self, request: int, now_ns: int) -> None:
         """Ends an `AskRoutes`, to which no more replies will come."""

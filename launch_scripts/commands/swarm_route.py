@@ -122,7 +122,11 @@ def ask_place(bus: Bus, where: Where, start: Place, end: Place, vehicle_class: s
         if found.status != "growing" or spent_s > _TIMEOUT_S:
             break
     if found.status != "ok":
-        raise TerrainError(f"there is no route to {written(frame, goal)}: {_NO_PLACE[found.status]}")
+        near = found.nearest_cell  # a planner may say anything
+        nearest = (
+            "" if near is None or near >= frame.grid.cells else f"; the nearest open cell is {written(frame, near)}"
+        )
+        raise TerrainError(f"there is no route to {written(frame, goal)}: {_NO_PLACE[found.status]}{nearest}")
     reply = RouteReply(
         target=_PLACE, incarnation=found.incarnation, target_cell=goal, map_version=found.map_version,
         tree_age_ms=0.0, rows=frame.grid.rows, cols=frame.grid.cols, routes=found.routes,

@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import logging
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple, Self
 
 import numpy as np
@@ -57,6 +57,8 @@ def rule_of(config: PlannerConfig) -> int:
 
 _SHORTEST_M, _LONGEST_M = 1e-30, 1e30
 """Sides of cells that float32 knows."""
+NEAR_CELLS = 256
+"""Rows and columns about a cell within which the nearest open one is looked for: some milliseconds."""
 _BLOCK = 1 << 10
 """Cells that are copied at a time: a page of memory."""
 _FEWEST, _MOST = 1 << 9, 1 << 14
@@ -376,6 +378,29 @@ class CostGrid:
 
     def _ways(self, parent: NDArray[np.uint8], root: int) -> route_kernels.Ways:
         return parent, *self._moves, root, self.stride
+
+    def nearest_open(
+        self, cell: int, first: int = 1, leads: Callable[[NDArray[np.int64]], NDArray[np.bool_]] | None = None
+    ) -> int | None:
+        """The open cell nearest to another; of equals the first of the grid. None if none is near.
+
+        first  rows and columns about it that are looked at first
+        leads  which of some cells, with the border, are preferred; those which are not count if no other is near
+        """
+        row, col = self.grid.row_col(cell)
+        costs = self.cell_cost.reshape(-1, self.stride)[1:-1, 1:-1]
+        for half in (*(first << n for n in range(8) if first << n < NEAR_CELLS), NEAR_CELLS):
+            window = self.grid.around(cell, half)
+            rows, cols = np.nonzero(costs[window.row0 : window.row1, window.col0 : window.col1] < np.inf)
+            rows, cols = rows + window.row0, cols + window.col0
+            away = (rows - row) ** 2 + (cols - col) ** 2
+            near = np.flatnonzero((away <= half**2) | (half == NEAR_CELLS))
+            led = near if leads is None else near[leads((rows[near] + 1) * self.stride + cols[near] + 1)]
+            chosen = led if led.size or half < NEAR_CELLS else near
+            if chosen.size:
+                best = int(chosen[away[chosen].argmin()])
+                return self.grid.cell(int(rows[best]), int(cols[best]))
+        return None
 
     def passable(self, cell: int) -> bool:
         """Returns True if a cell of the grid can be entered. Raises OutsideGridError where it is none of the

@@ -317,7 +317,7 @@ def plan_grid(
         return grid, None, notes
     resolution = resolution_m or float(f"{math.sqrt(width * height):.4g}")
     west, south, east, north = bounds_in(transform, rows, cols, crs, target)
-    high, wide = int((north - south) / resolution + 1e-6), int((east - west) / resolution + 1e-6)
+    high, wide = (int(min(side / resolution, MAX_CELLS) + 1e-6) for side in (north - south, east - west))
     if high < 1 or wide < 1:
         raise TerrainError(f"{what} is {north - south:.3g} x {east - west:.3g} m: no cell of {resolution:g} m fits")
     check_size(high, wide, what, resolution)

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -18,7 +18,8 @@ from numpy.typing import NDArray
 from shared_map.array_files import Floats
 
 _Doubles = NDArray[np.float64]
-Kernel = Callable[[_Doubles], _Doubles]
+Kernel = Callable[[_Doubles, float], _Doubles]
+"""Weight of a surveyed cell, by how far its middle is (in surveyed cells) and how large a cell of the file is."""
 
 _REACH = 3
 """Surveyed cells on either side that a filter weighs: a Lanczos filter three, the others fewer."""
@@ -47,50 +48,66 @@ _ALIKE = 3.0
 """Errors of rounding differ by less than this factor."""
 _LEVEL_M = 0.002
 """Recovered heights of still water differ by less."""
-_SMOOTH, _BEND = 1e-7, (1.0, -2.0, 1.0)
-"""Weight of bends of the survey: it moves heights by less than a millimetre where the sums determine them."""
+_SMOOTH = 1e-7
+"""Weight of steps of the survey: it moves heights by less than a millimetre where the sums determine them."""
 _AT_ONCE = 256
 """Columns that are solved together: their sums take some megabytes."""
+_HALF_WAY = 1e-3
+"""Surveyed cells by which an estimated place may be off."""
 _ROUNDINGS_M, _MOSTLY, _OFF = (0.1, 0.25, 0.5, 1.0), 0.9, 0.125
 """Usual roundings of heights. The coarsest that fits counts: 0.9 of all heights lie within an eighth of it."""
 
 
-def _linear(t: _Doubles) -> _Doubles:
+def _linear(t: _Doubles, _: float) -> _Doubles:
     return np.asarray(np.maximum(1 - np.abs(t), 0))
 
 
-def _cubic(t: _Doubles) -> _Doubles:
+def _mean(t: _Doubles, step: float) -> _Doubles:
+    return np.asarray(np.clip((1 + step) / 2 - np.abs(t), 0, step))
+
+
+def _cubic(t: _Doubles, _: float) -> _Doubles:
     t = np.abs(t)
     return np.where(t <= 1, 1.5 * t**3 - 2.5 * t**2 + 1, np.where(t < 2, -0.5 * t**3 + 2.5 * t**2 - 4 * t + 2, 0))
 
 
-def _lanczos(t: _Doubles) -> _Doubles:
+def _lanczos(t: _Doubles, _: float) -> _Doubles:
     return np.asarray(np.where(np.abs(t) < _REACH, np.sinc(t) * np.sinc(t / _REACH), 0))
 
 
-def _spline(t: _Doubles) -> _Doubles:
+def _spline(t: _Doubles, _: float) -> _Doubles:
     t = np.abs(t)
     return np.where(t < 1, 2 / 3 - t**2 + t**3 / 2, np.where(t < 2, (2 - t) ** 3 / 6, 0))
 
 
-KERNELS: tuple[Kernel, ...] = (_cubic, _lanczos, _linear, _spline)
+KERNELS: tuple[Kernel, ...] = (_cubic, _lanczos, _linear, _mean, _spline)
 
 
 @dataclass(frozen=True)
 class _Resampling:
-    """Cell n of a line lies at first + (n + 0.5) * step - 0.5 among the cells of the survey."""
+    """Cell n of a line lies at first + (n + 0.5) * step - 0.5 among the surveyed cells, and within the ends."""
 
     step: float
     first: float
     kernel: Kernel
+    ends: tuple[float, float] = (-math.inf, math.inf)
 
     def moved(self, cells: float) -> _Resampling:
         """The same, seen from another cell of the line."""
-        return _Resampling(self.step, self.first + cells * self.step, self.kernel)
+        return replace(self, first=self.first + cells * self.step)
 
     def at(self, count: int) -> _Doubles:
         """The place of each cell of a line."""
-        return self.first - 0.5 + self.step * (np.arange(count, dtype=np.float64) + 0.5)
+        return np.clip(self.first - 0.5 + self.step * (np.arange(count, dtype=np.float64) + 0.5), *self.ends)
+
+    def nearest(self, count: int) -> NDArray[np.intp]:
+        """The surveyed cell in which each cell of a line lies; half in two, in the same of them everywhere."""
+        return np.floor(self.at(count) + 0.5 + _HALF_WAY).astype(np.intp)
+
+    def inside(self, count: int) -> slice:
+        """The cells of a line which have two surveyed cells on either side."""
+        at, (first, last) = self.at(count), self.nearest(count)[[0, -1]]
+        return slice(int((at < first + 1).sum()), int((at < last - 1.01).sum()))
 
 
 def surveyed(elevation_m: Floats) -> tuple[Floats, NDArray[np.intp], NDArray[np.intp]]:
@@ -108,27 +125,24 @@ def surveyed(elevation_m: Floats) -> tuple[Floats, NDArray[np.intp], NDArray[np.
 
         nearest = ndimage.distance_transform_edt(void, return_distances=False, return_indices=True)
         heights_m = elevation_m[tuple(nearest)]
-    filled_m, of_line, is_cubic = heights_m, [], False
+    filled_m, of_line, cubic = heights_m, [], []
     for _ in range(2):
         at = _repeated(heights_m)
         if at[-1] + 1 < len(at):
             heights_m = heights_m[np.unique(at, return_index=True)[1]]
         elif (found := _resampling_of(heights_m)) is not None:
-            at = np.rint(found.at(len(heights_m))).astype(np.intp)
+            at = found.nearest(len(heights_m))
             heights_m = _recovered(heights_m, found)
             at -= at[0]
-            is_cubic |= found.kernel is _cubic
+            cubic += [found] * (found.kernel is _cubic)
         of_line.append(at)
         heights_m = heights_m.T
     rows, cols = of_line
     if heights_m.shape == elevation_m.shape:
         return elevation_m, rows, cols
     heights_m = np.ascontiguousarray(heights_m)
-    if is_cubic:  # which is linear at the border: the lowest of its sums is as high as the water in it
-        starts = [np.unique(at, return_index=True)[1] for at in of_line]
-        for line in (0, -1):
-            heights_m[line] = np.minimum.reduceat(filled_m[line], starts[1])
-            heights_m[:, line] = np.minimum.reduceat(filled_m[:, line], starts[0])
+    if len(cubic) == 2:
+        _take_linear_borders(heights_m, filled_m, *cubic)
     for step_m in _ROUNDINGS_M:
         whole_m = np.rint(heights_m / np.float32(step_m)) * np.float32(step_m)
         if (np.abs(heights_m - whole_m) < _OFF * step_m).mean() > _MOSTLY:
@@ -243,23 +257,35 @@ def _refined(lines: _Doubles, found: _Resampling, start: int, cells: int) -> _Re
 
 
 def _recovered(heights_m: Floats, by: _Resampling) -> Floats:
-    """The survey in the direction of columns.
-
-    Beyond the border of its file a filter has no cells to weigh. GDAL's cubic filter is a linear one there, whose
-    outermost sums are those of one surveyed cell; they are taken as they are.
-    """
+    """The survey in the direction of columns, without the sums of a cubic filter beside the border: these are
+    linear."""
     at = by.at(len(heights_m))
-    first, last = np.rint(at[[0, -1]]).astype(np.intp)
-    cut, start, stop = 0, 0, len(at)
-    if by.kernel is _cubic:
-        cut, start, stop = 1, int((at < first + 1).sum()), int((at < last - 1.01).sum())
-    by = by.moved(start)
-    before = int(np.floor(at[start])) + 1 - _REACH
-    inner = slice(first + cut - before, last + 1 - cut - before)
+    first, last = by.nearest(len(at))[[0, -1]]
+    inside = by.inside(len(at)) if by.kernel is _cubic else slice(0, len(at))
+    by = by.moved(inside.start)
+    before = int(np.floor(at[inside.start])) + 1 - _REACH
+    inner = slice(first - before, last + 1 - before)
     middle_m = np.float64(heights_m.mean())
-    parts = [heights_m[start:stop, n : n + _AT_ONCE] for n in range(0, heights_m.shape[1], _AT_ONCE)]
-    solved_m = np.hstack([(_solved(part - middle_m, by)[0][inner] + middle_m).astype(np.float32) for part in parts])
-    return np.vstack((heights_m[:cut], solved_m, heights_m[len(at) - cut :]))
+    parts = [heights_m[inside, n : n + _AT_ONCE] for n in range(0, heights_m.shape[1], _AT_ONCE)]
+    return np.hstack([(_solved(part - middle_m, by)[0][inner] + middle_m).astype(np.float32) for part in parts])
+
+
+def _take_linear_borders(survey_m: Floats, heights_m: Floats, down: _Resampling, right: _Resampling) -> None:
+    """Sets the outermost lines of a survey, of which a cubic filter's sums hold too little.
+
+    Beyond the border of its file a filter has no cells to weigh. GDAL's cubic filter is a linear one beside it, in
+    both directions.
+    """
+    sides = [
+        replace(by, kernel=_linear, ends=tuple(by.nearest(count)[[0, -1]]))
+        for by, count in zip((down, right), heights_m.shape, strict=True)
+    ]
+    for _ in range(2):
+        inside, (along, across) = down.inside(len(heights_m)), sides
+        for some in (slice(0, inside.start), slice(inside.stop, None)):
+            lines_m = _recovered(_recovered(heights_m[some], along.moved(some.start)).T, across).T
+            survey_m[-len(lines_m) if some.start else 0 :][: len(lines_m)] = lines_m
+        survey_m, heights_m, down, sides = survey_m.T, heights_m.T, right, sides[::-1]
 
 
 def _solved(heights_m: _Doubles, by: _Resampling) -> tuple[_Doubles, _Doubles, NDArray[np.intp]]:
@@ -270,16 +296,16 @@ def _solved(heights_m: _Doubles, by: _Resampling) -> tuple[_Doubles, _Doubles, N
     at = by.at(len(heights_m))
     cell = np.floor(at).astype(np.intp)
     near = cell[:, None] + np.arange(1 - _REACH, _REACH + 1)
-    weights = by.kernel(at[:, None] - near)
+    weights = by.kernel(at[:, None] - near, by.step)
     weights /= weights.sum(axis=1, keepdims=True)
     starts = np.flatnonzero(np.diff(cell, prepend=cell[0] - 1))
     width, groups = 2 * _REACH, len(starts)
     many = groups + width - 1
     banded = np.zeros((width, many))
-    # Cells beyond the border, with hardly a weight, go on as the others do.
-    for one in range(3):
-        for other in range(one, 3):
-            banded[other - one, one : one + many - 2] += _SMOOTH * _BEND[one] * _BEND[other]
+    # Cells beyond the border, with hardly a weight, are as high as those at it.
+    banded[0, 1:] += _SMOOTH
+    banded[0, :-1] += _SMOOTH
+    banded[1, :-1] -= _SMOOTH
     right = np.zeros((many, heights_m.shape[1]))
     for one in range(width):
         weight = weights[:, one, None]

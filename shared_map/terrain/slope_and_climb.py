@@ -118,9 +118,13 @@ def _without_steeper(factor: Floats, sine: Floats, most_deg: float) -> Floats:
     return factor
 
 
+_LEAST_DEG = 1e-6
+"""Less would be divided by as 0."""
+
+
 def _limit(cost: CostConfig) -> float:
     """Sine of `max_slope_deg`."""
-    return math.sin(math.radians(cost.max_slope_deg))
+    return math.sin(math.radians(max(cost.max_slope_deg, _LEAST_DEG)))
 
 
 def _sine(rise: Floats) -> Floats:

@@ -29,7 +29,7 @@ from swarm.config.explain import converted
 from swarm.config.ground import CostConfig
 from swarm.config.scenario import Scenario
 from swarm.config.vehicle_classes import GROUND, of_class
-from swarm.errors import TerrainError
+from swarm.errors import ArgumentError, TerrainError
 from swarm.grid import GridSpec
 from swarm.wire.messages.map_data import PACE_LEAST
 
@@ -82,7 +82,11 @@ def build_terrain(scenario: Scenario, progress: Progress = no_progress, vehicle_
     ConfigError on a setting that no file may have."""
     from shared_map.importers.terrain_sources import load_source
 
-    if isinstance(scenario.terrain.source, str | PathLike):  # of an array the reader says what to do
+    if not isinstance(scenario, Scenario):
+        raise ArgumentError(f"scenario is of type {type(scenario).__name__}, expected Scenario")
+    if isinstance(
+        getattr(scenario.terrain, "source", ""), str | PathLike
+    ):  # of an array the reader says what to do
         scenario = converted(scenario, Scenario, "the scenario")  # which may have been made in Python
     try:
         source = load_source(scenario.terrain, scenario.seed, progress)

@@ -11,17 +11,16 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-import msgspec
-
 from swarm.bus.bus import AskEnded, Bus, Replied
 from swarm.client.observer import EVERY_S, Observer
 from swarm.client.own_reports import Target
 from swarm.client.route import Route
 from swarm.client.session import Session, SwarmThread
-from swarm.client.terrain_frame import Frame, Point
+from swarm.client.terrain_frame import Frame, Point, listed, point
 from swarm.client.vehicle import Vehicle
 from swarm.clock import Clock, MonotonicClock
 from swarm.errors import BusError, ConfigError, NoAnswerError, RunMismatchError, SwarmError
+from swarm.grid import real
 from swarm.runtime.operator import AGAIN_S, Acknowledged, Operator, checked, replies_to
 from swarm.wire.access import OPERATOR, Authenticator
 from swarm.wire.messages import WIRE_VERSION, Nothing
@@ -127,9 +126,10 @@ class Orders:
         for_s         the zone ends by itself; None: never
         vehicle_class  for vehicles of this class only; None: for all
         """
+        corners = [list(point("polygon_m", corner)) for corner in listed("polygon_m", polygon_m)]
         fields = {
             "action": "add", "name": name, "kind": "lethal" if pace_s_per_m is None else "pace",
-            "pace_s_per_m": pace_s_per_m, "polygon_m": [*map(list, polygon_m)],
+            "pace_s_per_m": pace_s_per_m, "polygon_m": corners,
             "lasts_s": for_s, "vehicle_class": vehicle_class,
         }  # fmt: skip
         zones, acknowledged = self._operator.zone(checked(ZoneOrder, fields))
@@ -296,8 +296,9 @@ class Swarm:
         """
         until_s = time.monotonic() + self._session.number("timeout_s", timeout_s, 0, 1e9)
         served = any(name.startswith("places-") for name in self._session.run.crew)
-        start, goal = self.frame.cell(*start_m), self.frame.cell(*goal_m)
-        request = PlaceRouteRequest(to=goal, cells=[start], vehicle_class=vehicle_class)
+        start, goal = self.frame.cell(*point("start_m", start_m)), self.frame.cell(*point("goal_m", goal_m))
+        self._session.check_ids(vehicle_class=vehicle_class)
+        request = PlaceRouteRequest(to=goal, cells=[start], vehicle_class=str(vehicle_class))
         while True:
             left_s = max(until_s - time.monotonic(), 0.1)
             waiting = self._session.ask(PLACE_ROUTE, request, left_s, asker=asker_of(OPERATOR, "client"))
@@ -360,23 +361,20 @@ def connect(
     runs share the namespace or the run's wire version is no neighbour of ours.
     """
     from swarm.bus.zenoh_bus import open_bus
-    from swarm.config.explain import explain
-    from swarm.config.scenario import NetworkConfig, TlsConfig
+    from swarm.config.explain import converted
+    from swarm.config.scenario import NetworkConfig
     from swarm.endpoints import check_endpoint
     from swarm.runtime.inbox import Inbox
     from swarm.runtime.run_secret import authenticator_of
 
-    files = (ca, certificate, key)
-    if not all(files) and (any(files) or endpoint.startswith("tls/")):
+    given = {"ca": ca, "certificate": certificate, "key": key}
+    files = {name: each for name, each in given.items() if each is not None}
+    if files.keys() != given.keys() and (files or str(endpoint).startswith("tls/")):
         raise ConfigError(f"endpoint {endpoint!r}: a tls/ endpoint needs ca, certificate and key, others none")
-    check_endpoint(endpoint, all(files), "endpoint")
-    fields = {"namespace": namespace, "connect": [endpoint], "connect_timeout_s": timeout_s}
-    try:
-        network = msgspec.convert(fields, NetworkConfig)
-    except msgspec.ValidationError as error:
-        raise ConfigError(explain(str(error), fields, NetworkConfig)) from error
-    if ca and certificate and key:
-        network = msgspec.structs.replace(network, tls=TlsConfig(ca=ca, certificate=certificate, key=key))
+    timeout_s = real("timeout_s", timeout_s)
+    fields: dict[str, Any] = {"namespace": namespace, "connect": [endpoint], "connect_timeout_s": timeout_s}
+    network = converted(fields | ({"tls": files} if files else {}), NetworkConfig, "connect", "settings")
+    check_endpoint(endpoint, bool(files), "endpoint")
     began_s = time.monotonic()
     bus, inbox = open_bus(network), Inbox()
     try:

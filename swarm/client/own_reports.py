@@ -124,7 +124,7 @@ class Target(Reported):
     """
 
     def __init__(self, session: Session, id: str, tracker: str | None, lease_s: float) -> None:
-        session.check_ids(target=id, tracker=tracker)
+        session.check_ids(id=id, **({} if tracker is None else {"tracker": tracker}))
         lease_s = session.number("lease_s", lease_s, 0, LONGEST_LEASE_S, more=True)
         self.tracker = tracker
         self._tracking = Tracking(session.frame.grid)

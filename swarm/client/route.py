@@ -68,7 +68,7 @@ class Route:
             status = status if reply.status == "ok" else reply.status
             return cls(
                 frame, "", status, cells, route.cost_s, route.lower_bound_s, route.remaining_s,
-                target_cell=reply.to_cell,
+                target_cell=reply.to_cell, nearest_cell=reply.nearest_cell,
             )  # fmt: skip
         return cls(
             frame, reply.target or "", status, cells, route.cost_s, route.lower_bound_s, route.remaining_s,

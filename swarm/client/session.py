@@ -14,10 +14,11 @@ from typing import Any, Generic, Protocol, TypeVar
 
 from swarm.bus.bus import AskEnded, Bus, Event, LinkChanged, Post, Replied
 from swarm.client.route import Route
-from swarm.client.terrain_frame import Frame, number
+from swarm.client.terrain_frame import Frame
 from swarm.clock import NS_PER_S, Clock
 from swarm.config.explain import choice
 from swarm.errors import BusError, ConfigError, NoAnswerError, ProtocolError, RunMismatchError, SwarmError
+from swarm.grid import real, shown, whole
 from swarm.wire.codec import M, decode, encode
 from swarm.wire.fields import check_id
 from swarm.wire.messages import Message, Nothing
@@ -40,6 +41,9 @@ _SAME_CLOCK_NS = NS_PER_S
 _MOST_REPORTED = 1024
 """Problems that are remembered, to report each once. Beyond this number all are forgotten; then some are reported
 twice."""
+
+
+C = TypeVar("C", bound=Callable[..., Any])
 
 
 class Part(Protocol):
@@ -141,26 +145,22 @@ class Session:
         more  the value must exceed `least`
         """
         try:
-            found = number(name, value)
+            return real(name, value, least, most, more=more)
         except ConfigError as error:
             raise self.refused(str(error)) from None
-        if not least <= found <= most or (more and found == least):
-            bounds = f"more than {least:g} and at most {most:g}" if more else f"{least:.4g} ... {most:g}"
-            raise self.refused(f"{name} is {found!r}, expected {bounds}")
-        return found
 
-    def check_ids(self, **ids: str | None) -> None:
+    def check_ids(self, **ids: str) -> None:
         """Raises ConfigError, and counts it, where one of these is no id."""
         for name, id in ids.items():
             try:
-                if id is not None:
-                    check_id(name, id)
+                check_id(name, id)
             except ValueError as error:
                 raise self.refused(str(error)) from error
 
     def class_number(self, name: str, argument: str) -> int:
         """The number of one of the scenario's classes, by which marks name it. Raises ConfigError, and counts it,
         if there is no such class."""
+        self.check_ids(**{argument: name})
         classes = self.run.classes
         if name not in classes:
             known = f"there are {', '.join(classes)}" if classes else "the scenario has no [[classes]]"
@@ -187,8 +187,8 @@ class Session:
 
         Raises ConfigError if the target's id is none.
         """
-        self.check_ids(target=target)
-        request = RouteRequest(cells=[cell], vehicle_class=vehicle_class)
+        self.check_ids(target=target, vehicle_class=vehicle_class)
+        request = RouteRequest(cells=[cell], vehicle_class=str(vehicle_class))
         found: Future[Route] = Future()
 
         def finish(done: Future[list[Any]]) -> None:
@@ -223,7 +223,13 @@ class Session:
         self._later.append(callback)
 
     def on_problem(self, callback: Callable[[str], None]) -> None:
-        self._on_problem.append(callback)
+        self._on_problem.append(self.checked_call(callback))
+
+    def checked_call(self, callback: C) -> C:
+        """What is to be called. Raises ConfigError, and counts it, on anything else."""
+        if not callable(callback):
+            raise self.refused(f"callback is {shown(callback)}, expected a function")
+        return callback
 
     def problem(self, kind: str, sentence: str) -> None:
         """Counts a problem, and reports it in the log and to callbacks, once a minute."""
@@ -357,7 +363,7 @@ class Stream(Generic[T]):
     """
 
     def __init__(self, most: int = MOST_WAITING) -> None:
-        self._waiting: deque[T] = deque(maxlen=most)
+        self._waiting: deque[T] = deque(maxlen=whole("most", most))
         self._changed = threading.Condition()
         self.closed = False
         self.newest: T | None = None
@@ -379,6 +385,8 @@ class Stream(Generic[T]):
 
     def next(self, timeout_s: float | None = None) -> T | None:
         """The next value; None if there is none within the timeout, or it has ended."""
+        if timeout_s is not None:
+            timeout_s = real("timeout_s", timeout_s, -1e9, 1e9)
         with self._changed:
             self._changed.wait_for(lambda: self._waiting or self.closed, timeout_s)
             return self._waiting.popleft() if self._waiting else None

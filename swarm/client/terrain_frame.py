@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import math
-import reprlib
 from collections.abc import Callable
 from functools import cached_property
 from textwrap import shorten
 from typing import Any
 
-from swarm.errors import ConfigError, missing
-from swarm.grid import GridSpec, real, whole
+from swarm.errors import ArgumentError, ConfigError, missing
+from swarm.grid import GridSpec, real, shown, whole
 from swarm.places import Given, cell_of, written
 from swarm.wire.messages.processes import RunInfo
 
@@ -48,7 +47,7 @@ class Frame:
     def cell(self, x_m: float, y_m: float) -> int:
         """The cell at a place. Raises ConfigError on a location outside the terrain and on a value that is not a
         number."""
-        grid, x_m, y_m = self.grid, number("x_m", x_m), number("y_m", y_m)
+        grid, x_m, y_m = self.grid, real("x_m", x_m), real("y_m", y_m)
         if not (math.isfinite(x_m) and math.isfinite(y_m)):
             raise ConfigError(f"x_m {x_m!r}, y_m {y_m!r} is no place: both must be finite numbers of metres")
         row = math.floor((grid.north_m - y_m) / grid.resolution_m)
@@ -78,7 +77,7 @@ class Frame:
 
     def cells_within(self, x_m: float, y_m: float, radius_m: float) -> list[int]:
         """Returns the cells whose middle is within `radius_m` of a place inside the terrain, and its own cell."""
-        at, step, radius_m = self.cell(x_m, y_m), self.grid.resolution_m, number("radius_m", radius_m)
+        at, step, radius_m = self.cell(x_m, y_m), self.grid.resolution_m, real("radius_m", radius_m)
         if not 0 <= radius_m < math.inf:
             raise ConfigError(f"radius_m is {radius_m!r}, expected metres, 0 or more")
         window = self.grid.around(at, min(math.ceil(radius_m / step), max(self.grid.rows, self.grid.cols)))
@@ -92,13 +91,13 @@ class Frame:
     def from_wgs84(self, lat_deg: float, lon_deg: float) -> Point:
         """Returns (x_m, y_m) of a latitude and longitude in degrees. Raises ConfigError if they are out of range,
         if the terrain has no geographic reference, or if pyproj (extra `wgs84`) is not installed."""
-        if not (-90 <= number("lat_deg", lat_deg) <= 90 and -360 <= number("lon_deg", lon_deg) <= 360):
+        if not (-90 <= real("lat_deg", lat_deg) <= 90 and -360 <= real("lon_deg", lon_deg) <= 360):
             raise ConfigError(f"lat_deg {lat_deg!r}, lon_deg {lon_deg!r} is no place on Earth")
         return self._transforms[0](lon_deg, lat_deg)
 
     def to_wgs84(self, x_m: float, y_m: float) -> Point:
         """(lat_deg, lon_deg) of a place. Raises as `from_wgs84`."""
-        lon_deg, lat_deg = self._transforms[1](number("x_m", x_m), number("y_m", y_m))
+        lon_deg, lat_deg = self._transforms[1](real("x_m", x_m), real("y_m", y_m))
         return lat_deg, lon_deg
 
     @cached_property
@@ -130,18 +129,22 @@ def _degrees_of(system: Any) -> str:
 
 def checked_cell(frame: Frame, given: int) -> int:
     """A cell of the terrain. Raises ConfigError on one outside the terrain, and on a value that is not a cell."""
-    try:
-        cell = whole(given)
-    except TypeError:
-        raise ConfigError(f"cell {reprlib.repr(given)} is no whole number") from None
+    cell = whole("cell", given)
     if not 0 <= cell < frame.grid.cells:
         raise ConfigError(f"cell {cell} is outside the terrain of {frame.grid.rows} x {frame.grid.cols} cells")
     return cell
 
 
-def number(name: str, value: Any) -> float:
-    """Converts a program's number to a float. Raises ConfigError on anything else, such as text or truth."""
-    try:
-        return real(name, value)
-    except TypeError as error:
-        raise ConfigError(str(error)) from None
+def listed(name: str, given: Any) -> list[Any]:
+    """The items of a list, array or set. Raises ArgumentError on anything else, such as text; `name` is that of the
+    value."""
+    if isinstance(given, str | bytes) or not hasattr(given, "__iter__") or getattr(given, "ndim", 1) == 0:
+        raise ArgumentError(f"{name} is {shown(given)}, expected a list")
+    return list(given)
+
+
+def point(name: str, given: Any) -> Point:
+    """The two numbers of a place in metres. Raises ArgumentError on anything else."""
+    if len(pair := listed(name, given)) != 2:
+        raise ArgumentError(f"{name} is {shown(given)}, expected x_m and y_m")
+    return real(name, pair[0]), real(name, pair[1])

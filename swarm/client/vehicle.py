@@ -11,11 +11,11 @@ from swarm.bus.bus import Asked, Event, Heard, LinkChanged
 from swarm.client.own_reports import Reported
 from swarm.client.route import Route
 from swarm.client.session import Session, Stream
-from swarm.client.terrain_frame import checked_cell
+from swarm.client.terrain_frame import checked_cell, listed
 from swarm.clock import NS_PER_S
 from swarm.config.scenario import agent_of
 from swarm.errors import ConfigError
-from swarm.grid import TILE_CELLS, GridSpec
+from swarm.grid import TILE_CELLS, GridSpec, shown
 from swarm.wire.messages import map_data, planning
 from swarm.wire.messages.vehicles import LONGEST_OBSTACLE_LEASE_S, MOST_M_PER_S, MOST_RADIUS_M, Obstacle
 from swarm.wire.route_columns import RouteStatus
@@ -235,7 +235,7 @@ class Vehicle(Reported):
         `right_of_way`.
         """
         way, here = self._has_way(), self.cell
-        wanted = [checked_cell(self._session.frame, cell) for cell in cells]
+        wanted = [checked_cell(self._session.frame, cell) for cell in listed("cells", cells)]
         path = [here, *(wanted[1:] if wanted[:1] == [here] else wanted)]
         try:
             way.want(path)
@@ -279,7 +279,7 @@ class Vehicle(Reported):
         session = self._session
         with session.lock:
             session.check_open()
-            goal = session.frame.cell_named(target) if "," in target else None
+            goal = session.frame.cell_named(target) if isinstance(target, str) and "," in target else None
             if goal is None:
                 session.check_ids(target=target)
             _ = self.cell
@@ -293,7 +293,7 @@ class Vehicle(Reported):
     def on_route(self, callback: Callable[[Route], None]) -> None:
         """Calls with every route of the target that is followed. It is called on the connection's thread, so it
         must not wait for answers."""
-        self._on_route.append(callback)
+        self._on_route.append(self._session.checked_call(callback))
 
     def unfollow(self) -> None:
         """Follows nothing any more; streams of routes end."""
@@ -388,6 +388,9 @@ class Vehicle(Reported):
         exactly one thing is stated.
         """
         session = self._session
+        for name, flag in (("lethal", lethal), ("clear", clear)):
+            if type(flag).__name__ not in ("bool", "bool_"):
+                raise session.refused(f"{name} is {shown(flag)}, expected True or False")
         if (lethal, pace_s_per_m is not None, clear).count(True) != 1:
             raise session.refused("mark states one thing: lethal=True, pace_s_per_m=... or clear=True")
         if pace_s_per_m is not None:
@@ -401,7 +404,7 @@ class Vehicle(Reported):
         with session.lock:
             session.check_open()
             try:
-                once = dict.fromkeys(checked_cell(session.frame, cell) for cell in cells)
+                once = dict.fromkeys(checked_cell(session.frame, cell) for cell in listed("cells", cells))
             except ConfigError as error:
                 raise session.refused(str(error)) from None
             if not once:

@@ -217,7 +217,7 @@ def converted(
     """
     raw: Any = None
     try:
-        raw = msgspec.to_builtins(given, builtin_types=_DATES, enc_hook=_plain)
+        raw = plain(given)
         return msgspec.convert(raw, root)
     except msgspec.ValidationError as error:
         raise fault(f"{source}: {explain(str(error), raw, root, whole)}") from error
@@ -229,11 +229,24 @@ _DATES = (datetime.datetime, datetime.date, datetime.time, bytes)
 """Types that are no text, though JSON has texts for them."""
 
 
-def _plain(value: Any) -> Any:
+def plain(given: Any) -> Any:
     """A value of Python as a file has it: numbers of NumPy's are numbers, paths are texts."""
+    return msgspec.to_builtins(given, builtin_types=_DATES, enc_hook=_plain)
+
+
+def _plain(value: Any) -> Any:
     if isinstance(value, os.PathLike):
         return os.fspath(value)
-    return value.tolist() if hasattr(value, "tolist") else [type(value).__name__]
+    found: Any = value.tolist() if hasattr(value, "tolist") else [type(value).__name__]
+    return float(found) if type(found) is type(value) else found  # of more bits than Python's
+
+
+def check_keywords(given: Iterable[str], allowed: Sequence[str], what: str) -> None:
+    """Raises ConfigError, with the nearest one, on a keyword that is not allowed; `what` names what is called."""
+    for key in given:
+        if key not in allowed:
+            near = nearest(key, allowed)
+            raise ConfigError(f"{what}: unknown key {key}{near or allowed_here(allowed)}")
 
 
 def _is_refused(value: Any, hint: Any) -> bool:

@@ -7,6 +7,7 @@ from typing import Annotated, Any, Literal, get_args
 import msgspec
 from msgspec import Meta
 
+from swarm.config.explain import check_keywords
 from swarm.peers import HIGHEST_RANK
 
 Positive = Annotated[float, Meta(gt=0, le=1e12)]
@@ -68,5 +69,13 @@ CoverCode = Annotated[str, Meta(pattern=r"^[0-9]{1,5}\Z")]
 ElevationEncoding = Literal["metres"]
 
 
-class Section(msgspec.Struct, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class _Named(msgspec.StructMeta):
+    """Sections which, made in Python, say of an unknown keyword what they say of it in a file."""
+
+    def __call__(self, *args: Any, **settings: Any) -> Any:
+        check_keywords(settings, self.__struct_fields__, self.__name__)
+        return super().__call__(*args, **settings)
+
+
+class Section(msgspec.Struct, metaclass=_Named, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Base of the sections of a scenario."""

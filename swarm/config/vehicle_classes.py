@@ -54,8 +54,8 @@ def cost_of_preset(name: str | None) -> CostConfig:
     """The cost of a scenario which says nothing but this preset, if that. Raises ConfigError on an unknown one."""
     if name is None:
         return CostConfig()
-    if name not in PRESETS:
-        raise ConfigError(f"no preset {quoted(name)}{choice(name, list(PRESETS), ' there are ')}")
+    if not isinstance(name, str) or name not in PRESETS:
+        raise ConfigError(f"no preset {quoted(name)}{choice(str(name), list(PRESETS), ' there are ')}")
     return msgspec.convert(whole_cost({}, {"preset": name}), CostConfig)
 
 

@@ -69,12 +69,13 @@ Given = TypeVar("Given", GiveOrder, SendVehicle, ZoneOrder)
 
 def checked(kind: type[Given], fields: Mapping[str, Any]) -> Given:
     """The order of these fields; those which are None are left out. Raises ConfigError."""
-    from swarm.config.explain import explain
+    from swarm.config.explain import explain, plain
 
-    given = {name: value for name, value in fields.items() if value is not None}
+    given: dict[str, Any] = {}
     try:
+        given = plain({name: value for name, value in fields.items() if value is not None})
         return msgspec.convert({**given, "schema": schema_of_type(kind)}, kind)
-    except (msgspec.ValidationError, ValueError) as error:
+    except (msgspec.ValidationError, ValueError, TypeError, OverflowError) as error:
         said = str(error)
         ours = not said.startswith(("Expected", "Invalid", "Object"))  # what fields say of each other
         said = said.partition(" - at `$")[0] if ours else explain(said, given, kind)

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from support.planner_strategies import random_pace
 
-from planner_service import target_tree
 from planner_service.target_tree import TargetTree
+from planner_service.tree import cost_grid
 from swarm.config.scenario import PlannerConfig, Strategy
 from swarm.grid import GridSpec, Window
 
@@ -25,7 +25,7 @@ def nearest(grid: GridSpec, pace: np.ndarray, led: np.ndarray, cell: int, half: 
 def test_a_target_over_water_has_the_nearest_shore_from_which_a_tree_led(
     strategy: Strategy, near_cells: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(target_tree, "_NEAR_CELLS", near_cells)
+    monkeypatch.setattr(cost_grid, "NEAR_CELLS", near_cells)
     rng = np.random.default_rng(5)
     found = {"a shore": 0, "no tree leads there": 0, "none": 0, "stopped": 0}
     for n in range(40):

@@ -95,6 +95,7 @@ class PlaceRouteReply(Message, frozen=True, kw_only=True, tag=schema_of("place-r
     map_version  number of changes of its replica
     status       "lethal_goal", "outside_goal": there is no route; "growing": some are not known yet, and their
                  status is NO_TARGET: ask again
+    nearest_cell  the open cell nearest to a lethal goal; None if none is near
     """
 
     to_cell: fields.Cell
@@ -103,6 +104,7 @@ class PlaceRouteReply(Message, frozen=True, kw_only=True, tag=schema_of("place-r
     routes: Routes
     status: PlaceStatus = "ok"
     vehicle_class: fields.Id = GROUND
+    nearest_cell: fields.Cell | None = None
 
     def check(self) -> None:
         self.routes.check_bounds()

@@ -91,6 +91,12 @@ def test_routes_are_as_an_oracle_has_them_while_marks_change_the_map(seed: int) 
             reply, best = world.answer(to, *cells), optimum_s(now, to)
             if math.isinf(now.flat[to]):
                 assert reply.status == "lethal_goal" or all(math.isinf(now.flat[cell]) for cell in cells)
+                if reply.status == "lethal_goal":
+                    near, open_cells = reply.nearest_cell, np.argwhere(np.isfinite(now).reshape(GRID.shape))
+                    away = np.hypot(*(open_cells - GRID.row_col(to)).T).min()
+                    assert near is not None
+                    assert math.dist(GRID.row_col(near), GRID.row_col(to)) == pytest.approx(away)
+                    assert math.isfinite(now.flat[near])
                 continue
             for cell, route in zip(cells, reply.routes, strict=True):
                 if math.isinf(now.flat[cell]):
