@@ -41,9 +41,13 @@ def shown(value: Any) -> str:
 def whole(name: str, value: Any) -> int:
     """A whole number, also of NumPy's. Raises ArgumentError on anything else, such as 2.0 and True; Python takes
     that for 1. `name` is that of the value."""
-    if not isinstance(value, bool):
-        with suppress(TypeError):
+    if type(value) is int:  # first, as each cell comes through here
+        return value
+    try:
+        if not isinstance(value, bool):
             return operator.index(value)
+    except TypeError:
+        pass
     raise ArgumentError(f"{name} is {shown(value)}, expected a whole number")
 
 
@@ -200,9 +204,11 @@ class GridSpec:
 
     def cell_at(self, x_m: float, y_m: float) -> int:
         """The cell that holds a place, -1 outside the grid. Raises ArgumentError on what is no place."""
+        if type(x_m) is not float or type(y_m) is not float:  # looked at only then: vehicles ask all the time
+            x_m, y_m = real("x_m", x_m), real("y_m", y_m)
         try:
-            row = math.floor((self.north_m - real("y_m", y_m)) / self.resolution_m)
-            col = math.floor((real("x_m", x_m) - self.west_m) / self.resolution_m)
+            row = math.floor((self.north_m - y_m) / self.resolution_m)
+            col = math.floor((x_m - self.west_m) / self.resolution_m)
         except (ValueError, OverflowError) as error:
             raise ArgumentError(f"x_m {shown(x_m)}, y_m {shown(y_m)} is no place") from error
         return row * self.cols + col if self.inside(row, col) else -1
