@@ -15,7 +15,7 @@ from typing import Any
 import zenoh
 
 from swarm.bus import bus
-from swarm.bus.bus import SHARED, check_meant, check_named
+from swarm.bus.bus import check_meant, check_named
 from swarm.errors import ProtocolError
 from swarm.wire import codec
 from swarm.wire.access import Act, Authenticator, check_code, has_code
@@ -181,7 +181,7 @@ class Intake:
         if query.payload is None:
             parameters = dict(list(query.parameters))  # type: ignore[call-overload]
             parameters.pop(bus.TIMEOUT_PARAMETER, None)
-            check_named(self.below(key), parameters.pop(codec.KEY_FIELD, None))
+            check_named(self.below(key), parameters.pop(codec.KEY_FIELD, self.below(key)))
             self.check(topic, "ask", key, query, asked)
             return codec.decode_parameters(parameters, wanted)
         packed = codec.packed_json(asked, wanted) if is_json(query, asked) else asked
@@ -193,9 +193,9 @@ class Intake:
         """A payload as MessagePack, which is short enough, is meant for its key and has the code that its topic
         needs. Raises ProtocolError."""
         check_size(len(payload), topic.put_bytes)
-        in_json = is_json(sample, payload)
-        packed = codec.packed_json(payload, topic.message, self.fields(topic, key)) if in_json else payload
-        check_meant(self.below(key), packed, must=in_json and topic.message in SHARED)
+        fields = self.fields(topic, key) if is_json(sample, payload) else None
+        packed = payload if fields is None else codec.packed_json(payload, topic.message, fields)
+        check_meant(self.below(key), packed)
         self.check(topic, "put", key, sample, payload)
         return packed
 

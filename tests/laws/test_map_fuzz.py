@@ -17,6 +17,7 @@ from support.swarm_model import SwarmModel
 from shared_map.keeper.mark_store import KeeperStore
 from shared_map.replication.marks import fault, packed, unpacked
 from shared_map.replication.replica import MapReplica
+from swarm.bus.bus import meant_for
 from swarm.errors import ProtocolError
 from swarm.wire.codec import decode, decode_many, encode
 from swarm.wire.messages.map_data import DIGEST_ROW, Digest, MarkKind, MarkSet, MarkSets, MarksRequest
@@ -101,8 +102,9 @@ def test_mutated_payloads_on_the_bus_neither_stop_a_service_nor_keep_true_marks_
             (("b2.2", "agent"), ("k.1", "keeper"))]  # fmt: skip
     payloads = [encode(each) for each in examples()] if topic is MARKS else lies
     for n in range(min(MUTATIONS, 20_000) // 10):
-        payload = mutated(chance.choice(payloads), chance) if n % 10 else chance.choice(payloads)
         fields = {"region": "0", "tile": str(n % 6), "author": "b2.2"} if topic is MARKS else {"author": "b2.2"}
+        payload = meant_for(topic.below(fields), chance.choice(payloads))
+        payload = mutated(payload, chance) if n % 10 else payload
         swarm.put_bytes(hostile, topic, payload, **fields)
         if n % 50 == 0:
             swarm.run(0.1)
