@@ -127,7 +127,7 @@ class ZenohAnswerer:
         # Zenoh ends a query when its last handle goes; `drop` does it now, not at the next garbage collection.
         if self._query is not None:
             self._query.drop()  # type: ignore[no-untyped-call]
-            self._query = None
+            self._query = self.fault = None  # whose traceback holds what was asked, and this
 
 
 log = logging.getLogger(__name__)

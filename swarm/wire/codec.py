@@ -111,7 +111,7 @@ def _read(payload: bytes, message_type: type[M]) -> M:
 
 def decode_many(payloads: Sequence[bytes], message_type: type[M]) -> list[M | ProtocolError]:
     """Like `decode` for each payload, with errors in place. The statements of many mark sets are checked at
-    once."""
+    once. An error has no traceback, which would hold this list, and all payloads, until a collection of garbage."""
     at_once = len(payloads) >= _MANY_SETS and numpy_loaded()
     found: list[M | ProtocolError] = []
     unchecked: list[tuple[int, MarkSet]] = []
@@ -124,9 +124,7 @@ def decode_many(payloads: Sequence[bytes], message_type: type[M]) -> list[M | Pr
                 found.append(message)
             else:
                 found.append(_checked(message))
-        except ProtocolError as error:
-            found.append(error)
-        except ValueError as error:
+        except (ProtocolError, ValueError) as error:
             found.append(ProtocolError(str(error)[:300]))
     if unchecked:
         counts = np.array([len(each.kinds) for _, each in unchecked], np.int64)

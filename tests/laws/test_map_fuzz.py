@@ -3,9 +3,11 @@
 By hand, more: MAP_MUTATIONS=1000000 pytest tests/laws/test_map_fuzz.py"""
 
 import contextlib
+import gc
 import os
 import random
 from typing import TypeVar
+from weakref import ref
 
 import msgspec
 import numpy as np
@@ -86,6 +88,19 @@ def test_mutated_payloads_that_wait_together_pass_the_door_as_each_would_alone()
                 assert decode(payload, MarkSet) == found
             except ProtocolError:
                 assert isinstance(found, ProtocolError)
+
+
+def test_payloads_that_are_refused_together_are_freed_without_a_collection_of_garbage() -> None:
+    chance = random.Random(5)
+    some = [b"garbage", *(mutated(encode(each), chance) for each in examples() for _ in range(20))]
+    gc.collect()
+    gc.disable()
+    try:
+        refused = [ref(each) for each in decode_many(some, MarkSet) if isinstance(each, ProtocolError)]
+        assert len(refused) > 1
+        assert not [each for each in refused if each() is not None]
+    finally:
+        gc.enable()
 
 
 @pytest.mark.parametrize("topic", [MARKS, DIGEST])

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import gc
 import json
+import logging
 import os
 import re
 import signal
@@ -33,7 +35,7 @@ from docs.generate.wire_page import example, key_fields, put_from_outside
 from launch_scripts.ports import free_ports
 from swarm.bus.bus import Appeared, Asked, AskEnded, Disappeared, Heard, LinkChanged, Replied, meant_for
 from swarm.bus.endpoints import host_port
-from swarm.bus.zenoh_bus import ZenohBus, open_bus
+from swarm.bus.zenoh_bus import ZenohAnswerer, ZenohBus, open_bus
 from swarm.clock import MonotonicClock
 from swarm.config.scenario import NetworkConfig
 from swarm.errors import BusError
@@ -219,6 +221,22 @@ def test_a_bad_request_is_refused_in_words_and_counted(world):
     assert (planner.counts["payloads_dropped"], planner.counts["payloads_misrouted"]) == (5, 2)
 
 
+def test_what_a_refused_question_said_is_freed_without_a_collection_of_garbage(world, caplog):
+    caplog.set_level(logging.ERROR)  # a record that is kept has the error
+    planner, stranger = world.bus("planner"), world.bus("stranger").session
+    serve_cost(planner)
+    world.settle()
+    gc.collect()
+    gc.disable()
+    try:
+        for parameters, payload in (("", b"garbage"), ("?timeout_s=never", None), (f"?a={'x' * 300_000}", None)):
+            replies = list(stranger.get(f"swarm/target/t0/cost{parameters}", payload=payload, timeout=3.0))
+            assert [reply.ok for reply in replies] == [None]
+        world.until(lambda: not [each for each in gc.get_objects() if isinstance(each, ZenohAnswerer)])
+    finally:
+        gc.enable()
+
+
 def test_questions_tokens_and_links_wake_no_thread_between_and_an_inbox_decodes_a_question(world):
     planner, inbox, answers = world.bus("planner"), Inbox(), Box()
     before = threading.enumerate()
@@ -301,7 +319,7 @@ def test_a_router_killed_and_started_again_is_found_by_everybody(world):
 
 LEAVES_A_STALLED_ROUTER = """
 import os, signal, sys, time
-from swarm.bus.zenoh_bus import open_bus
+from swarm.bus.zenoh_bus import ZenohAnswerer, open_bus
 from swarm.config.scenario import NetworkConfig
 class SlowExit:
     def __del__(self, sleep=time.sleep): sleep(12)  # in which Zenoh gives the router up
