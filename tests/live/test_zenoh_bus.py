@@ -317,6 +317,35 @@ def test_a_router_killed_and_started_again_is_found_by_everybody(world):
         assert heard[-1] == Heard(POSE, {"target": "t0"}, pose(seq=times))
 
 
+ENDS_WITHOUT_CLOSING = """
+import atexit, sys
+from support.bus_world import note
+from swarm.bus.zenoh_bus import open_bus
+from swarm.config.scenario import NetworkConfig
+from swarm.wire.topics import NOTE
+
+def leave():
+    bus.publish(NOTE, note("gone"), role="agent", id="a0")
+    bus.unsubscribe(NOTE)
+    bus.close()
+    bus.unsubscribe(NOTE)
+
+atexit.register(leave)
+bus = open_bus(NetworkConfig(connect=(sys.argv[1],)))  # later than what uses it at the end
+bus.subscribe(NOTE, print)
+"""
+
+
+def test_what_a_program_registers_for_its_exit_still_has_its_bus(world):
+    _, _, box = heard_by(world, NOTE)
+    world.settle()
+    command = [sys.executable, "-c", ENDS_WITHOUT_CLOSING, world.router.endpoint]
+    ended = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert (ended.returncode, ended.stderr) == (0, "")
+    world.until(lambda: box)
+    assert box[0].message.text == "gone"
+
+
 LEAVES_A_STALLED_ROUTER = """
 import os, signal, sys, time
 from swarm.bus.zenoh_bus import ZenohAnswerer, open_bus
