@@ -10,6 +10,9 @@ refused with the place of the damage. Bytes behind them are a record that a cras
 acknowledged. The witness is a copy of the newest seal in the file of the lock: by it an older version of the file
 is noticed.
 
+A store that is deleted or changed while its process runs is noticed at the next commit, or within a second
+(`OwnFiles`). A journal is then written again from memory.
+
 A record is on the disk before the seal counts it, and the seal is written before `sync` returns. A seal is not
 synced itself: after a loss of power, the seal may count fewer records than are there, never more.
 """
@@ -18,6 +21,7 @@ from __future__ import annotations
 
 import errno
 import fcntl
+import logging
 import os
 import secrets
 import struct
@@ -30,6 +34,8 @@ from typing import NamedTuple
 from swarm.config.input_files import FileKind, read_bytes
 from swarm.errors import DamagedError, StoreError, SwarmError
 from swarm.files import make_folder, sync_folder, writing
+
+log = logging.getLogger(__name__)
 
 DIGEST_BYTES = 8
 """Bytes of a checksum: of damage one in 2^64 is missed. It is no defence against a forger."""
@@ -71,6 +77,54 @@ def read_seal(data: bytes, kind: str) -> Seal | None:
         return None
     magic, *fields = _HEAD.unpack(head)
     return Seal(kind, *fields) if magic.rstrip(b"\0") == f"swarm {kind}\n".encode() else None
+
+
+class OwnFiles:
+    """Files that this process alone writes, as it left them: by device, inode, size and time of change.
+
+    what  begins a sentence about one of them
+    """
+
+    def __init__(self, what: str, *paths: Path) -> None:
+        self._what, self._paths = what, paths
+        self._left: dict[Path, _State] = {}
+
+    def leave(self, *, new: bool = False) -> None:
+        """Notes the files after a write of ours.
+
+        new  they may be others than before
+        """
+        for path in self._paths:
+            now = _state(path)
+            if now is not None and (new or now[0] == self._left.get(path, now)[0]):
+                self._left[path] = now
+
+    def check(self, *, in_memory: bool) -> bool:
+        """Returns True if the files are as they were left, False if all has to be written again. Raises
+        DamagedError where a file has another content, or its name belongs to another one, perhaps of a process.
+
+        in_memory  what a changed file had is in memory, too
+        """
+        for path, left in self._left.items():
+            if (now := _state(path)) == left:
+                continue
+            how = "deleted" if now is None else "changed" if now[0] == left[0] else "replaced"
+            if how == "replaced" or (how == "changed" and not in_memory):
+                raise DamagedError(f"{self._what}{path} was {how} by another program while it was in use")
+            log.warning("%s%s was %s while it was in use: it is written again", self._what, path, how)
+            return False
+        return True
+
+
+_State = tuple[tuple[int, int], tuple[int, int]]
+
+
+def _state(path: Path) -> _State | None:
+    try:
+        found = path.stat()
+    except OSError:
+        return None
+    return (found.st_dev, found.st_ino), (found.st_size, found.st_mtime_ns)
 
 
 class Lock:
@@ -176,6 +230,7 @@ class Journal:
         self._seal = Seal(f"{kind.what} 1", secrets.token_bytes(8), 0, 0, b"")
         """The seal of all records, also of those which are not synced."""
         self.found: list[bytes] = []
+        self._own = OwnFiles("", path)
         self._lock = Lock(path, in_use, waits=waits)
         try:
             if path.exists():
@@ -187,7 +242,7 @@ class Journal:
     @property
     def ready(self) -> bool:
         """True if all that one event can bring will find space."""
-        return self._spare >= 0 or self._size - self._at >= self._size // 2
+        return self._spare >= 0 or (not self._is_broken and self._size - self._at >= self._size // 2)
 
     def begin(self) -> None:
         """Makes the file if there is none, and the spare one if it can. Empties `found`."""
@@ -197,7 +252,19 @@ class Journal:
         self.reserve()
 
     def reserve(self) -> str | None:
-        """Makes the spare file. Returns the reason if that fails, None if there is one."""
+        """Makes the spare file, and looks whether the file is as it was left. Returns the reason if that fails."""
+        try:
+            self._check_own()
+            self.sync()
+        except StoreError as error:
+            return str(error)
+        return self._reserve()
+
+    def _check_own(self) -> None:
+        if not self._is_broken and not self._own.check(in_memory=True):
+            self._synced, self._is_broken = False, True
+
+    def _reserve(self) -> str | None:
         if self._spare >= 0:
             with suppress(OSError):
                 if os.path.samestat(self._spare_path.stat(), os.fstat(self._spare)):
@@ -223,13 +290,17 @@ class Journal:
 
     def append(self, body: bytes) -> None:
         """Writes a record that is already among what still counts. It counts after the next `sync`."""
+        self._check_own()
+        if self._is_broken:
+            return  # `sync` writes all again
         seal, record = _chained(self._seal, [body])
         if self._at + len(record) > self._size:
             self._switch_to_spare()
-            self.reserve()
+            self._reserve()
             return
         with writing(self._path):
             _write(self._file, record, self._at)
+            self._own.leave()
         self._seal = seal
         self._at += len(record)
         self._synced = False
@@ -239,12 +310,12 @@ class Journal:
         if not self._synced:
             if self._is_broken:  # the system tells only once of a write that was lost: all is written again
                 self._switch_to_spare()
-                self._is_broken = False
                 return
             self._is_broken = True
             with writing(self._path):
                 os.fdatasync(self._file)
                 os.pwrite(self._file, self._seal.packed(), 0)
+                self._own.leave()
             self._is_broken = False
             self._lock.witness(self._seal)
             self._synced = True
@@ -293,7 +364,7 @@ class Journal:
 
     def _switch_to_spare(self) -> None:
         """Goes over to the spare file."""
-        if (why := self.reserve()) is not None:
+        if (why := self._reserve()) is not None:
             raise StoreError(why)
         first_digest = secrets.token_bytes(DIGEST_BYTES)  # remains in the spare file do not follow from it
         seal, records = _chained(self._seal._replace(first=self._seal.last, digest=first_digest), self._live())
@@ -309,7 +380,8 @@ class Journal:
             os.close(self._file)
         self._seal = seal
         self._file, self._size, self._at = self._spare, max(self._spare_size, len(content)), len(content)
-        self._spare, self._synced = -1, True
+        self._spare, self._synced, self._is_broken = -1, True, False
+        self._own.leave(new=True)
 
 
 def _chained(seal: Seal, bodies: Iterable[bytes]) -> tuple[Seal, bytes]:

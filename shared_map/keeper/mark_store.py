@@ -235,6 +235,7 @@ KEEPER_STORE = ExternalCalls(
         "orders": list[Order],
         "save_goals": None,
         "goals": list[VehicleGoals],
+        "check": None,
     },
     facts={"path": Path},
 )

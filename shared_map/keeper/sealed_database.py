@@ -12,7 +12,7 @@ import os
 import secrets
 import sqlite3
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
 from urllib.parse import quote
@@ -21,8 +21,8 @@ import msgspec
 
 from swarm.config.input_files import FileKind, check_bytes
 from swarm.errors import DamagedError, ProtocolError, StoreError, SwarmError
-from swarm.files import sync_folder, writing
-from swarm.journal import DIGEST_BYTES, Lock, Seal, check_witness, digest_of, read_seal, witness_of
+from swarm.files import make_folder, sync_folder, writing
+from swarm.journal import DIGEST_BYTES, Lock, OwnFiles, Seal, check_witness, digest_of, read_seal, witness_of
 
 log = logging.getLogger(__name__)
 
@@ -98,8 +98,8 @@ class SealedDatabase:
 
     A commit is on the disk when it returns (WAL with synchronous=FULL): it survives kill -9 of this process at any
     instant, and a power cut if the disk flushes as requested. All methods raise DamagedError where the file is not
-    as it was written, which is looked for at the start and at each row that is read, and StoreError if it cannot be
-    written.
+    as it was written, which is looked for at the start, at each row that is read and at each commit (`check`), and
+    StoreError if it cannot be written.
 
     tables     those of the file beside `meta`
     rebuild    move a damaged file aside, and begin an empty one
@@ -116,6 +116,7 @@ class SealedDatabase:
         self._sum = 0
         """The sum of the digests of all rows, within an open transaction too."""
         self._seal = Seal(_KIND, secrets.token_bytes(8), 0, 0, bytes(DIGEST_BYTES))
+        self._own = OwnFiles("the store ", self.path, Path(f"{path}-wal"))
         self._lock: Lock | None = None
         if not self._in_memory and self.path.is_file():
             check_bytes(self.path, FileKind.STORE)
@@ -143,6 +144,7 @@ class SealedDatabase:
     @contextmanager
     def _writing(self) -> Iterator[None]:
         """Commits all or nothing. A StoreError leaves the store usable."""
+        self.check()
         before, seal = self._sum, self._seal
         try:
             with self._db:
@@ -160,9 +162,36 @@ class SealedDatabase:
             raise StoreError(f"cannot write the store {self.path}: {error}") from error
         finally:
             self._sum = before
+            self._own.leave()
         self._seal = seal
         if self._lock is not None:
             self._lock.witness(seal)
+
+    def check(self) -> None:
+        """Looks whether the file is as it was left. SQLite holds a deleted one open: a copy gets its name."""
+        if self._lock is None or self._own.check(in_memory=False):
+            return
+        try:
+            with self._new_file() as part, closing(sqlite3.connect(part)) as copy:
+                self._db.backup(copy)
+        except sqlite3.Error as error:
+            raise StoreError(f"cannot write the store {self.path}: {error}") from error
+        self._db.close()
+        self._db = self._opened()
+
+    @contextmanager
+    def _new_file(self) -> Iterator[Path]:
+        """Yields the path of a file which becomes the store: it is whole, or not there."""
+        part = Path(f"{self.path}.part")
+        make_folder(part.parent)
+        with writing(self.path):
+            part.unlink(missing_ok=True)
+            yield part
+            # A log beside it is of a store that was moved away; SQLite would replay it.
+            for tail in ("-wal", "-shm"):
+                Path(f"{self.path}{tail}").unlink(missing_ok=True)
+            part.replace(self.path)
+            sync_folder(self.path.parent)
 
     def _check_own(self) -> None:
         """Begins a transaction. Raises DamagedError if another process has written the file, which only a deleted
@@ -209,15 +238,8 @@ class SealedDatabase:
         if self._in_memory:
             return self._begun(_connect(_MEMORY))
         if not self._read_only and not self.path.exists():
-            part = Path(f"{self.path}.part")  # the store is whole or not there
-            with writing(self.path):
-                part.unlink(missing_ok=True)
+            with self._new_file() as part:
                 self._begun(_connect(part)).close()
-                # A log beside it is of a store that was moved away; SQLite would replay it.
-                for tail in ("-wal", "-shm"):
-                    Path(f"{self.path}{tail}").unlink(missing_ok=True)
-                part.replace(self.path)
-                sync_folder(self.path.parent)
         witness = witness_of(self.path, _KIND)
         db = _connect(self.path, read_only=self._read_only)
         try:
@@ -280,6 +302,7 @@ class SealedDatabase:
         if self._lock is not None:
             self._watch(db)
             self._lock.witness(seal)  # there may be none
+            self._own.leave(new=True)
         return db
 
 

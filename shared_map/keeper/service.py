@@ -206,15 +206,16 @@ class KeeperService(MemberService):
             self._stats[key] = stats
 
     def _save_sightings(self, now_ns: int) -> None:
-        """Saves the newest sightings. They are for people to look at, so a full disk is no reason to try again."""
+        """Saves the newest sightings, and looks whether the store is as it was left. Sightings are for people to
+        look at, so a full disk is no reason to try again."""
         self._sightings_due_ns = now_ns + NS_PER_S
         best, targets = self._sightings.best(now_ns), self._orders.book.targets(self._scenario)
         new = {id: best[id] for id in best if id in targets and self._seen.get(id) != best[id]}
         self._sightings.expire(now_ns)
-        if new:
-            self._seen.update(new)
-            with suppress(StoreError):
-                self._store.save_sightings(new.values())
+        self._seen.update(new)
+        with suppress(StoreError):
+            self._store.check()
+            self._store.save_sightings(new.values())
 
     def _name_throttled(self, now_ns: int) -> None:
         """Notes each author that begins to exceed its quota."""

@@ -48,7 +48,8 @@ from swarm.wire.topics import NO_ASKER, TOPICS, UNPROVEN, Topic
 SHARED = frozenset(
     kind for kind, uses in Counter(topic.message for topic in TOPICS if topic.published).items() if uses > 1
 )
-"""Messages that are put on several topics. JSON of these must name its key."""
+"""Messages that are put on several topics. JSON of these must name its key, which that of others may leave out for
+one version."""
 _KEY_NAME = b"\xa3" + KEY_FIELD.encode()
 _FEW_FIELDS = 16
 """A map of fewer fields has one byte as its head, else three."""
@@ -88,14 +89,12 @@ _MOST_KEY = 512
 """Characters of a key: those of our topics have fewer."""
 
 
-def check_meant(key: str, payload: bytes, *, must: bool = False) -> None:
-    """Raises MisroutedError on a payload that is meant for another key, ProtocolError on one that must name its key
-    and does not. A payload that does not parse passes: the decoder says why.
+def check_meant(key: str, payload: bytes) -> None:
+    """Raises MisroutedError on a payload that is meant for another key, ProtocolError on one that names no key.
+    A payload that does not parse passes: the decoder says why.
 
     key      below the namespace
     payload  MessagePack, also of what came as JSON
-    must     the key must be named: in JSON of a message in `SHARED`. Elsewhere it may be left out as long as builds
-             of wire version 8, which name none, share a run
     """
     if len(key) > _MOST_KEY:
         raise ProtocolError(f"its key has {len(key)} characters, at most {_MOST_KEY}")
@@ -107,15 +106,14 @@ def check_meant(key: str, payload: bytes, *, must: bool = False) -> None:
         if f"$.{KEY_FIELD}" not in str(error):
             return
         raise ProtocolError(f"{KEY_FIELD} is no text, expected {key[:200]!r}") from error
-    check_named(key, named, must=must)
-
-
-def check_named(key: str, named: str | None, *, must: bool = False) -> None:
-    """Raises as `check_meant`, on a key that is named or not."""
     if named is None:
-        if must:
-            raise ProtocolError(f"no {KEY_FIELD}, expected {key[:200]!r}: other topics have this message, too")
-    elif named != key:
+        raise ProtocolError(f"no {KEY_FIELD}, expected {key[:200]!r}")
+    check_named(key, named)
+
+
+def check_named(key: str, named: str) -> None:
+    """Raises MisroutedError where another key is named than the one that came."""
+    if named != key:
         raise MisroutedError(f"it is meant for {named[:200]!r}")
 
 

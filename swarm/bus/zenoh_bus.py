@@ -127,7 +127,7 @@ class ZenohAnswerer:
         # Zenoh ends a query when its last handle goes; `drop` does it now, not at the next garbage collection.
         if self._query is not None:
             self._query.drop()  # type: ignore[no-untyped-call]
-            self._query = None
+            self._query = self.fault = None  # whose traceback holds what was asked, and this
 
 
 log = logging.getLogger(__name__)
@@ -190,6 +190,18 @@ def _why_not(error: zenoh.ZError, network: NetworkConfig, mode: str) -> BusError
     return BusError(f"cannot reach a router at {places}")
 
 
+_OPEN: dict[ZenohBus, None] = {}
+"""All buses, the oldest first."""
+
+
+@atexit.register
+def _close_all() -> None:
+    """Closes each bus at the exit of the interpreter: after what other modules registered, such as the close of a
+    client, by which vehicles leave."""
+    for bus in reversed([*_OPEN]):
+        bus.close()
+
+
 class ZenohBus:
     """A `Bus` on one Zenoh session, which `close` or the interpreter's exit closes.
 
@@ -219,7 +231,7 @@ class ZenohBus:
         """One per channel; those that have ended are removed when the next is ended."""
         self._closing = threading.Event()
         """Set by `close`, for good: nothing is sent from then on."""
-        atexit.register(self.close)
+        _OPEN[self] = None
 
     @property
     def authenticator(self) -> Authenticator | None:
@@ -421,7 +433,7 @@ class ZenohBus:
         if self.closed:
             return
         self._closing.set()
-        atexit.unregister(self.close)
+        _OPEN.pop(self, None)
         if not threading.main_thread().is_alive():  # at the exit, where no thread can be started
             self._undeclare()
             return
@@ -432,7 +444,7 @@ class ZenohBus:
             log.warning("the router does not answer: left without closing the session")
 
     def _undeclare_all(self, entities: Iterable[Any]) -> None:
-        for entity in entities:
+        for entity in () if self.closed else entities:
             self._entities.remove(entity)
             entity.undeclare()  # which ends the thread that reads its channel
         self._threads = [thread for thread in self._threads if thread.is_alive()]  # those of earlier ones

@@ -181,10 +181,10 @@ class Intake:
         if query.payload is None:
             parameters = dict(list(query.parameters))  # type: ignore[call-overload]
             parameters.pop(bus.TIMEOUT_PARAMETER, None)
-            check_named(self.below(key), parameters.pop(codec.KEY_FIELD, None))
+            check_named(self.below(key), parameters.pop(codec.KEY_FIELD, self.below(key)))
             self.check(topic, "ask", key, query, asked)
             return codec.decode_parameters(parameters, wanted)
-        packed = codec.packed_json(asked, wanted) if is_json(query, asked) else asked
+        packed = codec.packed_json(asked, wanted, None, self.below(key)) if is_json(query, asked) else asked
         check_meant(self.below(key), packed)
         self.check(topic, "ask", key, query, asked)
         return codec.decode(packed, wanted)
@@ -193,9 +193,11 @@ class Intake:
         """A payload as MessagePack, which is short enough, is meant for its key and has the code that its topic
         needs. Raises ProtocolError."""
         check_size(len(payload), topic.put_bytes)
-        in_json = is_json(sample, payload)
-        packed = codec.packed_json(payload, topic.message, self.fields(topic, key)) if in_json else payload
-        check_meant(self.below(key), packed, must=in_json and topic.message in SHARED)
+        packed, below = payload, self.below(key)
+        if is_json(sample, payload):
+            otherwise = "" if topic.message in SHARED else below
+            packed = codec.packed_json(payload, topic.message, self.fields(topic, key), otherwise)
+        check_meant(below, packed)
         self.check(topic, "put", key, sample, payload)
         return packed
 

@@ -135,6 +135,7 @@ class ExternalService:
                 pass
 
     def tick(self, now_ns: int) -> None:
+        self.generations.check()
         external = self.external
         if not (self._asking or (external is not None and external.settled)) and now_ns >= self._ask_due_ns:
             self._ask(now_ns)

@@ -67,6 +67,9 @@ class MemoryGenerations:
     def save(self, generations: Sequence[int]) -> None:
         self.generations = list(generations)
 
+    def check(self) -> None:
+        """Looks whether the file is as it was left."""
+
     def close(self) -> None:
         """Gives it to another process."""
 
@@ -96,6 +99,9 @@ class GenerationFile(MemoryGenerations):
         super().save(generations)
         self._journal.append(_encoded(generations))
         self._journal.sync()
+
+    def check(self) -> None:
+        self._journal.reserve()
 
     def close(self) -> None:
         self._journal.close()

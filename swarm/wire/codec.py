@@ -111,7 +111,7 @@ def _read(payload: bytes, message_type: type[M]) -> M:
 
 def decode_many(payloads: Sequence[bytes], message_type: type[M]) -> list[M | ProtocolError]:
     """Like `decode` for each payload, with errors in place. The statements of many mark sets are checked at
-    once."""
+    once. An error has no traceback, which would hold this list, and all payloads, until a collection of garbage."""
     at_once = len(payloads) >= _MANY_SETS and numpy_loaded()
     found: list[M | ProtocolError] = []
     unchecked: list[tuple[int, MarkSet]] = []
@@ -124,9 +124,7 @@ def decode_many(payloads: Sequence[bytes], message_type: type[M]) -> list[M | Pr
                 found.append(message)
             else:
                 found.append(_checked(message))
-        except ProtocolError as error:
-            found.append(error)
-        except ValueError as error:
+        except (ProtocolError, ValueError) as error:
             found.append(ProtocolError(str(error)[:300]))
     if unchecked:
         counts = np.array([len(each.kinds) for _, each in unchecked], np.int64)
@@ -266,12 +264,15 @@ def may_be_json(payload: bytes) -> bool:
     return bool(payload) and payload[0] < 0x80
 
 
-def packed_json(payload: bytes, message_type: type[Message], named: Mapping[str, str] | None = None) -> bytes:
+def packed_json(
+    payload: bytes, message_type: type[Message], named: Mapping[str, str] | None = None, key: str = ""
+) -> bytes:
     """The MessagePack of a message written as JSON: what `decode` reads. Raises ProtocolError, and nothing else.
 
     `schema` may be left out, as the key implies it.
 
     named  the fields of the key, which may be left out as well
+    key    for which it is meant if it does not say so, as JSON of 0.2 does not; may be left out for one version
     """
     if len(payload) > MAX_JSON_BYTES:
         raise ProtocolError(f"JSON of {len(payload)} bytes, at most {MAX_JSON_BYTES}; MessagePack may be longer")
@@ -287,7 +288,7 @@ def packed_json(payload: bytes, message_type: type[Message], named: Mapping[str,
             is_number = taken_apart(hints[name])[0] is int and chunk.isdecimal() and len(chunk) < _MOST_DIGITS
             given[name] = int(chunk) if is_number else chunk  # of more digits `int` raises ValueError
     schema = given.pop("schema", schema_of_type(message_type))
-    meant = {KEY_FIELD: given.pop(KEY_FIELD)} if KEY_FIELD in given else {}
+    meant = {KEY_FIELD: given.pop(KEY_FIELD, key)} if key or KEY_FIELD in given else {}
     try:
         fields = _turned(given, message_type, "", _packed_column)
         packed: bytes = msgpack.packb({"schema": schema} | fields | meant)

@@ -9,6 +9,7 @@ from typing import Any
 import msgpack
 from support.message_fuzzer import MessageFuzzer
 
+from swarm.bus.bus import meant_for
 from swarm.wire.codec import encode
 from swarm.wire.topics import TOPICS
 
@@ -52,8 +53,8 @@ class Hostile:
         if kind == "lies" or not self._keys:
             topic = chance.choice(_PUBLISHED)
             message = self._fuzzer.message(topic.message)
-            key = topic.keyed(self._namespace, **self._fuzzer.fields(topic, message))
-            return "lies", key, encode(message), None
+            key = topic.below(self._fuzzer.fields(topic, message))
+            return "lies", f"{self._namespace}/{key}", meant_for(key, encode(message)), None
         key = chance.choice(self._keys)
         payload, code = chance.choice(self._heard[key])
         if kind == "flipped":

@@ -3,9 +3,11 @@
 By hand, more: MAP_MUTATIONS=1000000 pytest tests/laws/test_map_fuzz.py"""
 
 import contextlib
+import gc
 import os
 import random
 from typing import TypeVar
+from weakref import ref
 
 import msgspec
 import numpy as np
@@ -17,6 +19,7 @@ from support.swarm_model import SwarmModel
 from shared_map.keeper.mark_store import KeeperStore
 from shared_map.replication.marks import fault, packed, unpacked
 from shared_map.replication.replica import MapReplica
+from swarm.bus.bus import meant_for
 from swarm.errors import ProtocolError
 from swarm.wire.codec import decode, decode_many, encode
 from swarm.wire.messages.map_data import DIGEST_ROW, Digest, MarkKind, MarkSet, MarkSets, MarksRequest
@@ -87,6 +90,19 @@ def test_mutated_payloads_that_wait_together_pass_the_door_as_each_would_alone()
                 assert isinstance(found, ProtocolError)
 
 
+def test_payloads_that_are_refused_together_are_freed_without_a_collection_of_garbage() -> None:
+    chance = random.Random(5)
+    some = [b"garbage", *(mutated(encode(each), chance) for each in examples() for _ in range(20))]
+    gc.collect()
+    gc.disable()
+    try:
+        refused = [ref(each) for each in decode_many(some, MarkSet) if isinstance(each, ProtocolError)]
+        assert len(refused) > 1
+        assert not [each for each in refused if each() is not None]
+    finally:
+        gc.enable()
+
+
 @pytest.mark.parametrize("topic", [MARKS, DIGEST])
 def test_mutated_payloads_on_the_bus_neither_stop_a_service_nor_keep_true_marks_from_it(topic: object) -> None:
     chance = random.Random(5)
@@ -101,8 +117,9 @@ def test_mutated_payloads_on_the_bus_neither_stop_a_service_nor_keep_true_marks_
             (("b2.2", "agent"), ("k.1", "keeper"))]  # fmt: skip
     payloads = [encode(each) for each in examples()] if topic is MARKS else lies
     for n in range(min(MUTATIONS, 20_000) // 10):
-        payload = mutated(chance.choice(payloads), chance) if n % 10 else chance.choice(payloads)
         fields = {"region": "0", "tile": str(n % 6), "author": "b2.2"} if topic is MARKS else {"author": "b2.2"}
+        payload = meant_for(topic.below(fields), chance.choice(payloads))
+        payload = mutated(payload, chance) if n % 10 else payload
         swarm.put_bytes(hostile, topic, payload, **fields)
         if n % 50 == 0:
             swarm.run(0.1)

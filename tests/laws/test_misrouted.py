@@ -39,12 +39,11 @@ def test_a_payload_says_its_key_and_the_same_message_and_counts_under_no_other_k
         payload = meant_for(key, plain)
         assert decode(payload, kind) == message
         assert msgpack.unpackb(payload, strict_map_key=False)[KEY_FIELD] == key
-        check_meant(key, payload, must=True)
-        check_meant(key, plain)  # wire version 8
+        check_meant(key, payload)
         with pytest.raises(MisroutedError, match="meant for"):
             check_meant(other, payload)
         with pytest.raises(ProtocolError, match="no key, expected"):
-            check_meant(key, plain, must=True)
+            check_meant(key, plain)
 
     holds()
 
@@ -53,16 +52,25 @@ def test_a_payload_says_its_key_and_the_same_message_and_counts_under_no_other_k
 def test_json_says_its_key_as_well(kind):
     message = BY_TYPE[kind]
     payload = packed_json(encode_json(message, "a/b"), kind)
-    check_meant("a/b", payload, must=True)
+    check_meant("a/b", payload)
     with pytest.raises(MisroutedError, match=re.escape("it is meant for 'a/b'")):
         check_meant("a/c", payload)
+    unnamed = encode_json(message)
+    with pytest.raises(ProtocolError, match="no key, expected 'a/b'"):
+        check_meant("a/b", packed_json(unnamed, kind))
+    check_meant("a/b", packed_json(unnamed, kind, None, "a/b"))  # as 0.2 wrote it
+
+
+def test_json_must_name_its_key_where_topics_share_a_message():
+    uses = Counter(topic.message for topic in TOPICS if topic.published)
+    assert {kind for kind in uses if uses[kind] > 1} == SHARED == {TargetPose, Chasers}
 
 
 @pytest.mark.parametrize("named", [5, None, ["a"], {"a": 1}, b"a", "a" * 100_000])
 def test_a_key_that_is_none_ends_in_a_sentence(named):
     payload = msgpack.packb({"schema": "nothing/8", KEY_FIELD: named})
     with pytest.raises(ProtocolError) as caught:
-        check_meant("a", payload, must=True)
+        check_meant("a", payload)
     assert len(str(caught.value)) < 300
 
 
@@ -74,12 +82,6 @@ def test_garbage_is_left_to_the_decoder_or_is_a_protocol_error(payload, key):
             check_meant(key, candidate)
         except ProtocolError:
             continue
-
-
-def test_topics_that_share_a_message_are_known():
-    """JSON must name its key on topics of another one, too."""
-    uses = Counter(topic.message for topic in TOPICS if topic.published)
-    assert {kind for kind in uses if uses[kind] > 1} == SHARED == {TargetPose, Chasers}
 
 
 # --- the simulated network confuses prefixes at reconnects, as routers do ---------

@@ -1,10 +1,13 @@
-"""Files of stores that a disk has changed: each is read as it was written, or refused in a sentence.
+"""Files of stores that a disk or a program has changed: each is read as it was written, or refused in a sentence.
 
 By hand, with more files: `PYTHONPATH=.:tests python tests/laws/test_rotten_files.py 2000`"""
 
+import os
+import re
 import shutil
 import sys
 import tempfile
+import time
 from collections import Counter
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -12,6 +15,7 @@ from pathlib import Path
 from random import Random
 
 import pytest
+from msgspec.structs import replace
 from support.effort import few
 from support.map_strategies import set_of
 
@@ -19,8 +23,9 @@ from shared_map.keeper.mark_store import KeeperStore
 from shared_map.terrain.store import load_homes, load_terrain, load_truth, prepare
 from shared_map.vehicle_class_grounds import class_grounds, load_classes, prepare_classes
 from swarm.config.scenario_files import parse_scenario
-from swarm.errors import SwarmError
+from swarm.errors import DamagedError, SwarmError
 from swarm.grid import GridSpec
+from swarm.right_of_way.agent_core import OwnRecord
 from swarm.right_of_way.generations import GenerationFile
 from swarm.right_of_way.promise_store import FilePromiseStore
 from swarm.runtime.role_setup import RoleSetup
@@ -77,11 +82,15 @@ def read_marks(path: Path) -> Parts:
 
 def commit_promises(path: Path, number: int) -> None:
     store = FilePromiseStore(path)
+    save_promises(store, number)
+    store.close()
+
+
+def save_promises(store: FilePromiseStore, number: int) -> None:
     grants = {f"a1-{k:02d}": Held.of([(1000 * number + k, number, k)]) for k in range(8)}
     for seq in range(3):
         store.save(number, Table(shard=seq, agent="a1", epoch=number, seq=seq, hosts={"a1": (7, 1)}, grants=grants))
     store.sync()
-    store.close()
 
 
 def read_promises(path: Path) -> Parts:
@@ -211,6 +220,90 @@ def test_a_commit_that_a_kill_cut_short_is_there_record_by_record_or_not(tmp_pat
             torn = whole[: chance.randrange(len(whole))]
         found = opened(kind, tmp_path, {**after, written: torn, "store.lock": before["store.lock"]})
         assert all(part in each for part, *each in zip(found, old, new, strict=True))
+
+
+HARMS: dict[str, Callable[[Path, bytes], object]] = {
+    "deleted": lambda path, old: path.unlink(),
+    "moved away": lambda path, old: path.rename(path.with_name("elsewhere")),
+    "folder deleted": lambda path, old: shutil.rmtree(path.parent),
+    "replaced": lambda path, old: (path.with_name("new").write_bytes(old), path.with_name("new").replace(path)),
+    "truncated": lambda path, old: os.truncate(path, len(old) // 2),
+    "emptied": lambda path, old: os.truncate(path, 0),
+    "written over": lambda path, old: path.write_bytes(old),
+}
+"""Deeds of another program to a file in use. It has a copy of it as it was a commit before."""
+
+
+class Running:
+    """A process which goes on with its store."""
+
+    def __init__(self, name: str, path: Path) -> None:
+        self.number, self.name, self.path = 0, name, path
+        self.store = {"marks": KeeperStore, "promises": FilePromiseStore, "lives": GenerationFile}[name](path)
+
+    def commit(self) -> None:
+        self.number += 1
+        match self.store:
+            case KeeperStore():
+                save_marks(self.store, self.number)
+            case FilePromiseStore():
+                save_promises(self.store, self.number)
+            case GenerationFile():
+                self.store.save([*self.store.generations, self.number])
+
+    def look(self) -> None:
+        """Looks after the store, as it does each second while nothing is to be saved."""
+        if isinstance(self.store, FilePromiseStore):
+            assert self.store.reserve() is None
+        else:
+            self.store.check()
+
+    def killed(self) -> Parts:
+        """Returns the content that the next process finds."""
+        held = self.store._db if isinstance(self.store, KeeperStore) else None
+        self.store._unlock() if isinstance(self.store, KeeperStore) else self.store.close()
+        found = KINDS[self.name].read(self.path)
+        if held is not None:
+            held.close()
+        return found
+
+
+@pytest.mark.parametrize("idle", [False, True], ids=["at a commit", "at rest"])
+@pytest.mark.parametrize("harm", HARMS)
+@pytest.mark.parametrize("name", ["marks", "promises", "lives", "log of marks"])
+def test_a_file_harmed_in_use_is_written_again_or_ends_its_process(
+    tmp_path: Path, name: str, harm: str, idle: bool
+) -> None:
+    name, tail = ("marks", "-wal") if name == "log of marks" else (name, "")
+    whole, tried = (Running(name, tmp_path / each / "store") for each in ("whole", "tried"))
+    for each in (whole, tried):
+        for _ in range(3):
+            each.commit()
+    file = Path(f"{tried.path}{tail}")
+    old = file.read_bytes()
+    for each in (whole, tried):
+        each.commit()
+    time.sleep(0.02)  # the clock of file systems ticks a hundred times a second
+    HARMS[harm](file, old)
+    changed = harm in ("truncated", "emptied", "written over")
+    if harm == "replaced" or (changed and name == "marks"):
+        with pytest.raises(
+            DamagedError, match=re.escape(f"{file} was {'changed' if changed else harm} by another")
+        ):
+            tried.look() if idle else tried.commit()
+        return
+    tried.look() if idle else tried.commit()
+    if not idle:
+        whole.commit()
+    tried.look()
+    truth = whole.killed()
+    found = tried.killed()
+    assert comparable(found) == comparable(truth)
+
+
+def comparable(parts: Parts) -> Parts:
+    """Without the number of a file, which is chance."""
+    return tuple(replace(part, disk=0) if isinstance(part, OwnRecord) else part for part in parts)
 
 
 PREPARED = parse_scenario("""

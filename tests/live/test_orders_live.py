@@ -121,7 +121,7 @@ class Stranger:
 
     def order(self, what: str, **order: Any) -> list[Any]:
         """The replies; a refusal is a text."""
-        payload = json.dumps(order).encode()
+        payload = json.dumps({"key": f"order/0/{what}"} | order).encode()
         return self.ask(f"swarm/order/0/{what}", payload, self.code(f"swarm/order/0/{what}", payload))
 
     def ask(self, selector: str, payload: bytes | None, code: bytes | None) -> list[Any]:
@@ -186,7 +186,7 @@ def test_a_hundred_targets_of_a_stranger_start_nothing(live: LiveSwarm, session:
         "marks/0/0/all.a88.1": marks,
     }
     for key, said in forged.items():
-        session.put(f"swarm/{key}", json.dumps(said), encoding=zenoh.Encoding.APPLICATION_JSON)
+        session.put(f"swarm/{key}", json.dumps({"key": key} | said), encoding=zenoh.Encoding.APPLICATION_JSON)
     time.sleep(4.0)  # a launcher of a part waits for three seconds
     held = [str(reply.ok.key_expr) for reply in session.get("swarm/marks/**") if reply.ok]
     assert not {"swarm/marks/0/0/operator.f", "swarm/marks/0/0/all.a88.1"}.intersection(held)

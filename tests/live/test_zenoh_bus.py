@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import gc
 import json
+import logging
 import os
 import re
 import signal
@@ -32,7 +34,7 @@ from docs.generate.wire_page import JSON_PATH as WIRE_PAGE
 from docs.generate.wire_page import example, key_fields, put_from_outside
 from launch_scripts.ports import free_ports
 from swarm.bus.bus import Appeared, Asked, AskEnded, Disappeared, Heard, LinkChanged, Replied, meant_for
-from swarm.bus.zenoh_bus import ZenohBus, open_bus
+from swarm.bus.zenoh_bus import ZenohAnswerer, ZenohBus, open_bus
 from swarm.clock import MonotonicClock
 from swarm.config.scenario import NetworkConfig
 from swarm.endpoints import host_port
@@ -123,13 +125,14 @@ def test_a_person_may_put_json_by_its_encoding_and_leave_out_what_the_key_says(w
     short = unnamed[:-1] + b', "key": "world/target/t0/pose"}'
     world.put_bytes(a, TRUE_POSE, short, in_json=True, target="t0")
     world.put_bytes(a, TRUE_POSE, short, in_json=True, target="t4")  # it is meant for t0
-    world.put_bytes(a, TRUE_POSE, unnamed, in_json=True, target="t5")  # the key of a pose is not implied
+    world.put_bytes(a, TRUE_POSE, unnamed, in_json=True, target="t5")  # its key is not implied
     world.put_bytes(a, TRUE_POSE, short, target="t1")  # without the encoding it is garbage
-    world.put_bytes(
-        a, TRUE_POSE, encode(pose("t2")), in_json=True, target="t2"
-    )  # whatever it says, this is MessagePack
+    packed = meant_for("world/target/t2/pose", encode(pose("t2")))
+    world.put_bytes(a, TRUE_POSE, packed, in_json=True, target="t2")  # whatever it says, this is MessagePack
     world.put_bytes(a, TRUE_POSE, b'{"target": "t9", ' + short[2:].replace(b"t0", b"t3"), in_json=True, target="t3")
-    world.put_bytes(a, MARKS, encode_json(marks("a0.1", 7)), in_json=True, region="0", tile="7", author="a0.1")
+    world.put_bytes(
+        a, MARKS, encode_json(marks("a0.1", 7), "marks/0/7/a0.1"), in_json=True, region="0", tile="7", author="a0.1"
+    )
     world.put_bytes(a, MARKS, b'{"epoch": "x"', in_json=True, region="0", tile="8", author="a0.1")
     world.until(lambda: len(alone) == 2)
     assert [event.message for event in alone] == [pose(), pose("t2")]
@@ -209,12 +212,29 @@ def test_a_bad_request_is_refused_in_words_and_counted(world):
         ("swarm/target/t0/cost?row=4;col=5;key=target/t0/route", None, b"it is meant for 'target/t0/route'"),
         ("swarm/target/t0/cost", meant_for("target/t1/cost", encode(CostRequest(row=4, col=5))), b"is meant for"),
         ("swarm/target/t0/cost", b"garbage", b"cost: "),
-        ("swarm/target/t0/cost", encode(Nothing()), b"schema"),
+        ("swarm/target/t0/cost", encode(CostRequest(row=4, col=5)), b"no key, expected 'target/t0/cost'"),
+        ("swarm/target/t0/cost", meant_for("target/t0/cost", encode(Nothing())), b"schema"),
     ):
         (reply,) = stranger.get(selector, payload=payload, timeout=2.0)
         assert complaint in reply.err.payload.to_bytes()
     assert requests == []
-    assert (planner.counts["payloads_dropped"], planner.counts["payloads_misrouted"]) == (4, 2)
+    assert (planner.counts["payloads_dropped"], planner.counts["payloads_misrouted"]) == (5, 2)
+
+
+def test_what_a_refused_question_said_is_freed_without_a_collection_of_garbage(world, caplog):
+    caplog.set_level(logging.ERROR)  # a record that is kept has the error
+    planner, stranger = world.bus("planner"), world.bus("stranger").session
+    serve_cost(planner)
+    world.settle()
+    gc.collect()
+    gc.disable()
+    try:
+        for parameters, payload in (("", b"garbage"), ("?timeout_s=never", None), (f"?a={'x' * 300_000}", None)):
+            replies = list(stranger.get(f"swarm/target/t0/cost{parameters}", payload=payload, timeout=3.0))
+            assert [reply.ok for reply in replies] == [None]
+        world.until(lambda: not [each for each in gc.get_objects() if isinstance(each, ZenohAnswerer)])
+    finally:
+        gc.enable()
 
 
 def test_questions_tokens_and_links_wake_no_thread_between_and_an_inbox_decodes_a_question(world):
@@ -297,9 +317,38 @@ def test_a_router_killed_and_started_again_is_found_by_everybody(world):
         assert heard[-1] == Heard(POSE, {"target": "t0"}, pose(seq=times))
 
 
+ENDS_WITHOUT_CLOSING = """
+import atexit, sys
+from support.bus_world import note
+from swarm.bus.zenoh_bus import open_bus
+from swarm.config.scenario import NetworkConfig
+from swarm.wire.topics import NOTE
+
+def leave():
+    bus.publish(NOTE, note("gone"), role="agent", id="a0")
+    bus.unsubscribe(NOTE)
+    bus.close()
+    bus.unsubscribe(NOTE)
+
+atexit.register(leave)
+bus = open_bus(NetworkConfig(connect=(sys.argv[1],)))  # later than what uses it at the end
+bus.subscribe(NOTE, print)
+"""
+
+
+def test_what_a_program_registers_for_its_exit_still_has_its_bus(world):
+    _, _, box = heard_by(world, NOTE)
+    world.settle()
+    command = [sys.executable, "-c", ENDS_WITHOUT_CLOSING, world.router.endpoint]
+    ended = subprocess.run(command, capture_output=True, text=True, timeout=60, check=False)
+    assert (ended.returncode, ended.stderr) == (0, "")
+    world.until(lambda: box)
+    assert box[0].message.text == "gone"
+
+
 LEAVES_A_STALLED_ROUTER = """
 import os, signal, sys, time
-from swarm.bus.zenoh_bus import open_bus
+from swarm.bus.zenoh_bus import ZenohAnswerer, open_bus
 from swarm.config.scenario import NetworkConfig
 class SlowExit:
     def __del__(self, sleep=time.sleep): sleep(12)  # in which Zenoh gives the router up
@@ -547,7 +596,7 @@ def test_a_person_asks_in_json_and_is_answered_in_json_or_told_what_is_wrong(wor
         (reply,) = b.session.get("swarm/target/t0/cost", payload=text, encoding=encoding, timeout=3.0)
         return reply
 
-    reply = get('{"row": 4, "col": 2}')
+    reply = get('{"key": "target/t0/cost", "row": 4, "col": 2}')
     assert json.loads(reply.ok.payload.to_bytes())["cost_to_go_s"] == [2.5, None]
     assert requests == [CostRequest(row=4, col=2)]
     wrong = get('{"rwo": 4}').err.payload.to_string()
