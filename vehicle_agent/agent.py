@@ -525,7 +525,7 @@ class Agent:
         return begun
 
     def _why(self, reply: PlaceRouteReply) -> str:
-        """Why no route leads to a place, or the status which says that."""
+        """The reason why no route leads to a place, or the status which says that."""
         near, grid = reply.nearest_cell, self._map.grid
         if near is None or near >= grid.cells:
             return reply.status

@@ -226,7 +226,7 @@ class Session:
         self._on_problem.append(self.checked_call(callback))
 
     def checked_call(self, callback: C) -> C:
-        """What is to be called. Raises ConfigError, and counts it, on anything else."""
+        """A function to be called. Raises ConfigError, and counts it, on anything else."""
         if not callable(callback):
             raise self.refused(f"callback is {shown(callback)}, expected a function")
         return callback

@@ -257,6 +257,7 @@ DAMAGED = {
     "poly": "none\n1\n   9.0  46.9\n   9.1 46.9\nEND\nEND\n",
     "parquet": "PAR1....",
     "inav": "geozone 0 1 0 0 0 0 0 4\n",
+    "inav mission": '<?xml version="1.0"?>\n<mission><geozone no="0" shape="Circular"/></mission>',
 }
 
 
@@ -281,6 +282,8 @@ REASONS = {
     "osm as JSON": "an answer of Overpass as JSON",
     "fen": r"fence of Mission Planner .* save it as \.waypoints",
     "poly": "an area of Osmosis",
+    "inav": "geozones by INAV; it is not read; draw",
+    "inav mission": "geozones by INAV; it is not read; draw",
 }
 
 
