@@ -114,7 +114,7 @@ def run_trial(trial: Trial) -> Result:
         )
     began_s, cpu_s = time.perf_counter(), time.thread_time()
     report, broken = _with_faults(trial) if trial.faults else _plain(trial)
-    gc.collect()  # services are cyclic, and collected rarely: a process of a thousand trials would grow by 2 MB each
+    gc.collect()  # services are cyclic, and collected rarely: a process of 1,000 trials would grow by 2 MB each
     return Result(
         key=trial.key,
         figures=dict(numbers({name: value for name, value in report.items() if name not in _LEFT_OUT})),
