@@ -249,6 +249,7 @@ _SYNONYMS = {
     "list": ("ls", "ps"), "ls": ("ps",), "init": ("new",), "create": ("new", "add"), "version": ("--version",),
     "delete": ("remove",), "rm": ("remove",), "plan": ("deploy plan",), "terrain route": ("swarm route --terrain",),
     "dem": ("terrain info",), "watch": ("top",), "validate": ("check",), "sweep": ("study run",),
+    "go": ("start",), "gone": ("forget",), "map": ("marks",), "synth": ("generate",), "plugins": ("check",),
     **{name: (f"role {name}",) for name in ("router", "keeper", "planner", "places", "agent", "monitor")},
     "bench": ("./launch_scripts/bench of a checkout",), "chaos": ("./launch_scripts/bench chaos of a checkout",),
 }  # fmt: skip

@@ -29,7 +29,7 @@ from swarm.config.scenario_files import load_scenario
 from swarm.config.vehicle_classes import cost_of_preset
 from swarm.endpoints import check_endpoint
 from swarm.errors import ConfigError, StoreError
-from swarm.files import make_folder, writing
+from swarm.files import check_writable, make_folder, writing
 from swarm.journal import digest_of
 from swarm.peers import split_rank
 
@@ -165,6 +165,8 @@ def make_run_dir(runs: Path, run_id: str) -> Path:
         raise ConfigError(f"run id {run_id!r} would name another folder than a new one in {runs}; choose another")
     run_dir = runs / run_id
     try:
+        if not run_dir.exists():  # a restart works on a full disk
+            check_writable(next(filter(Path.is_dir, (runs, *runs.absolute().parents))), file=run_dir)
         make_folder(run_dir)
     except StoreError as error:
         raise StoreError(f"{error}; --runs names another folder for runs") from error

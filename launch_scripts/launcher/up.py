@@ -71,6 +71,7 @@ _ELSEWHERE = f"the run is recorded and reported by the launcher that starts {REC
 def run_swarm(options: run_options.UpOptions) -> int:
     """Runs to the end. The exit code is 0 only if every process ended as it was asked to. Raises SwarmError."""
     check_start(options.scenario, joins=options.joins, has_ground=not options.asks_for_ground)
+    authenticator_of(options.scenario.network, "")  # raises where the secret cannot be read or made
     for spec in options.table:
         run_options.as_process(options.scenario, spec.role, spec.id)  # raises where its certificate is missing
     check_plugins(options.scenario, options.roles)

@@ -144,6 +144,17 @@ def test_a_simulation_whose_trace_finds_no_space_says_so(tmp_path: Path, swarm: 
     assert said.splitlines()[-1] == "swarm: cannot write /dev/full: No space left on device"
 
 
+def test_a_run_without_space_for_its_report_ends_before_it_begins(tmp_path: Path) -> None:
+    """A limit of 32 blocks of 1 KiB for each file stands for the full disk."""
+    words = f"trap '' XFSZ; ulimit -f 32; exec {sys.executable} -m launch_scripts.entry"
+    said = subprocess.run(
+        ["bash", "-c", f"{words} simulate synthetic --seconds 1 --runs {tmp_path}"], capture_output=True, text=True
+    )
+    assert (said.returncode, said.stdout) == (6, "")
+    assert re.search(r"swarm: cannot write \S+: File too large; --runs names another", said.stderr), said.stderr
+    assert not list(tmp_path.iterdir())
+
+
 def test_a_folder_that_takes_no_data_is_named_once_a_minute_and_when_it_does_again(tmp_path: Path) -> None:
     folder = tmp_path / "run"
     watch = DiskWatch(folder)
