@@ -99,7 +99,8 @@ def needs_of(scenario: Scenario, cells: int) -> RunNeeds:
     classes = 1 + len(scenario.classes)
     kept = settings.place_trees_bytes(settings.PLACE_TREES_BYTES, classes, cells)
     memory += len(settings.places_of(scenario)) * classes * (kept + cells * _TREE_CELL_BYTES)
-    recording = int(min(scenario.seconds / 60 * _RECORDING_BYTES_PER_MINUTE, _MOST_BYTES))
+    lasts_s = scenario.seconds if scenario.seconds < settings.UNTIL_STOPPED_S else 0.0  # how long is not known
+    recording = int(min(lasts_s / 60 * _RECORDING_BYTES_PER_MINUTE, _MOST_BYTES))
     taken = needs_on(1, swarm_of(scenario, cells), standbys)
     cores, planner_cores = sum(taken.cpu_cores.values()), taken.process["planner"]
     disk = cells * _CELL_BYTES + recording

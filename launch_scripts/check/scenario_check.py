@@ -151,7 +151,8 @@ def _certificates(scenario: Scenario, tls: TlsConfig, whole: bool) -> Iterator[F
             return
     if lacking and whole:
         several = f" and {len(lacking) - 1} more" if len(lacking) > 1 else ""
-        yield failure("network.tls", f"{tls.certificate} has no certificate of {lacking[0]}{several}; {make}")
+        told = f"{tls.certificate} has no certificate of {lacking[0]}{several}; {make}"
+        yield failure("network.tls", f"{told}, and one machine of several needs its own only")
 
 
 def plugins(scenario: Scenario) -> Iterator[Finding]:

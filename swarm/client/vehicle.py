@@ -210,7 +210,7 @@ class Vehicle(Reported):
                 speed_m_per_s=session.number("speed_m_per_s", speed_m_per_s, 0, MOST_M_PER_S),
                 radius_m=self.radius_m,
             )
-        if self._way is not None and not self._way.stands(cell):
+        if self._way is not None and not self._way.stands(self._way.counted(cell, x_m, y_m)):
             session.problem("unreserved", f"vehicle {self.id} is in cell {cell}, into which it was not let: stop")
 
     @property
@@ -234,7 +234,8 @@ class Vehicle(Reported):
         Raises ConfigError if a cell is not beside the one before it, and unless the vehicle was made with
         `right_of_way`.
         """
-        way, here = self._has_way(), self.cell
+        way, cell, word = self._has_way(), self.cell, self._word
+        here = cell if word is None else way.counted(cell, word.x_m, word.y_m)
         wanted = [checked_cell(self._session.frame, cell) for cell in listed("cells", cells)]
         path = [here, *(wanted[1:] if wanted[:1] == [here] else wanted)]
         try:

@@ -311,6 +311,12 @@ class ExternalSession:
             self._vehicle.left(cell)
             self._service.tell(self._clock.now_ns())
 
+    def counted(self, cell: int, x_m: float, y_m: float) -> int:
+        """The cell in which the vehicle counts at a place in `cell` (`ExternalVehicle.counted`)."""
+        with self._changed:
+            external = self._service.external
+            return cell if external is None else external.counted(cell, x_m, y_m)
+
     def stands(self, cell: int) -> bool:
         """The vehicle is in a cell: those behind it are given back. Returns whether it was let in there.
 

@@ -3,6 +3,7 @@ removes it (docs/design/external-vehicles.md)."""
 
 from __future__ import annotations
 
+import math
 from collections import defaultdict
 from collections.abc import Sequence
 from itertools import pairwise
@@ -62,6 +63,11 @@ class Answers:
 ExternalAction = AskKnown | Tell | Left
 
 
+_ASIDE = 0.25
+"""Sides of a cell by which a vehicle may be off the line of a diagonal step. It is then at least 0.45 of them from
+the middles of the cells beside the step. Chosen, not measured."""
+
+
 class ExternalVehicle:
     """One vehicle that speaks for itself. It has no seat among members; else it is a host as any other.
 
@@ -96,6 +102,20 @@ class ExternalVehicle:
     def cells(self) -> tuple[int, ...]:
         """The cells that it may stand on and enter, in driving order, its own first."""
         return () if self.host.replaced else tuple(self.host.open(self.vehicle))
+
+    def counted(self, cell: int, x_m: float, y_m: float) -> int:
+        """The cell in which it counts at a place in `cell`. The line of a diagonal step passes a corner of two other
+        cells: within `_ASIDE` of that line it is still in the cell that it leaves."""
+        grid = self.host.shards.grid
+        for tail, head in pairwise(self.cells) if cell not in self.cells else ():
+            (x0_m, y0_m), (x1_m, y1_m) = grid.centre_m(tail), grid.centre_m(head)
+            east_m, south_m = x1_m - x0_m, y1_m - y0_m
+            step_m = math.hypot(east_m, south_m)
+            along_m = ((x_m - x0_m) * east_m + (y_m - y0_m) * south_m) / step_m
+            aside_m = abs((x_m - x0_m) * south_m - (y_m - y0_m) * east_m) / step_m
+            if 0.0 <= along_m <= step_m and aside_m <= _ASIDE * grid.resolution_m:
+                return tail
+        return cell
 
     @property
     def gone(self) -> bool:

@@ -156,6 +156,9 @@ class NeverAsked:
     def stands(self, cell: int) -> bool:
         return True
 
+    def counted(self, cell: int, x_m: float, y_m: float) -> int:
+        return cell
+
 
 @pytest.mark.parametrize("wrong", [TRUTH, np.bool_(False), TEXT, b"7", None, [1.0, 2.0], math.nan])
 def test_what_is_no_number_is_refused_by_every_call_that_takes_one(world: Swarm, wrong: Any) -> None:

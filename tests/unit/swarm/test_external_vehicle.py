@@ -1,8 +1,10 @@
 """An external vehicle's side of right of way, and the bounds that leaders set to external vehicles."""
 
+import math
 from pathlib import Path
 from unittest.mock import MagicMock
 
+import numpy as np
 import pytest
 from msgspec.structs import replace
 
@@ -75,6 +77,30 @@ def test_it_enters_drives_on_what_it_is_granted_and_gives_back_what_it_does_not_
     for heartbeat in range(1, 4):
         talk(external, leader, heartbeat * 300_000_000)
     assert external.gone
+
+
+@pytest.mark.parametrize("beside", [1, GRID.cols, -GRID.cols], ids=["straight", "down", "up"])
+def test_on_a_diagonal_step_it_may_clip_the_cells_beside_it_and_no_others(beside: int) -> None:
+    """The middle of the step is a corner of four cells."""
+    external, leader = entered(700)
+    goal = 701 if beside == 1 else 701 + beside
+    external.want([700, goal])
+    talk(external, leader, 1)
+    assert external.cells == (700, goal)
+    (x0_m, y0_m), (x1_m, y1_m) = GRID.centre_m(700), GRID.centre_m(goal)
+    step_m = math.hypot(x1_m - x0_m, y1_m - y0_m)
+    for along in np.linspace(0, 1, 41):
+        for aside_m in (-0.6, -0.24, 0.0, 0.24, 0.6):
+            x_m = x0_m + along * (x1_m - x0_m) + aside_m * (y1_m - y0_m) / step_m
+            y_m = y0_m + along * (y1_m - y0_m) - aside_m * (x1_m - x0_m) / step_m
+            cell = GRID.cell_at(x_m, y_m)
+            counted = external.counted(cell, x_m, y_m)
+            if cell in external.cells:
+                assert counted == cell
+            else:
+                assert counted == (700 if abs(aside_m) < 0.25 else cell)
+    away_m = GRID.centre_m(710)
+    assert external.counted(710, *away_m) == 710
 
 
 def test_what_a_driver_says_wrong_is_one_sentence() -> None:
