@@ -141,8 +141,7 @@ def write_route(route: DescribedRoute, path: Path) -> None:
     without a place on Earth or a terrain where the format needs one."""
     ending = path.suffix.lower()
     if ending in MISSIONS:
-        if route.grid.crs == "local":
-            raise ConfigError(f"--out {path}: the terrain has no place on Earth; write .csv, .geojson or .gpkg")
+        gis_formats.check_on_earth(path, MapFrame(route.grid))
         x_m, y_m = middles_of(route.grid, gis_formats.turns_of(route.cells, route.grid))
         gis_formats.write_mission(
             path, [(lat, lon) for lat, lon in MapFrame(route.grid).to_degrees(x_m, y_m).T.tolist()]

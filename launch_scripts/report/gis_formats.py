@@ -107,6 +107,13 @@ def check_target(path: Path | None, option: str, *endings: str, force: bool = Fa
     check_writable(path.parent, file=path)
 
 
+def check_on_earth(path: Path, frame: MapFrame) -> None:
+    """Raises ConfigError where the terrain lies nowhere, and the file's format needs latitudes."""
+    if frame.grid.crs == "local":
+        known = "name its system (--crs, terrain.crs), or write .csv, .geojson or .gpkg"
+        raise ConfigError(f"--out {path}: the terrain has no place on Earth: {known}")
+
+
 def write_layers(path: Path, layers: Sequence[Layer], frame: MapFrame) -> None:
     """Writes layers in the format of the file's ending; of formats which hold one layer, the first.
 
@@ -118,10 +125,10 @@ def write_layers(path: Path, layers: Sequence[Layer], frame: MapFrame) -> None:
         If the file cannot be written.
     """
     check_target(path, "--out", *FORMATS, force=True)
-    ending, placed = path.suffix.lower(), frame.grid.crs != "local"
+    ending = path.suffix.lower()
     driver = FORMATS[ending]
-    if not placed and ending in ON_EARTH:
-        raise ConfigError(f"--out {path}: the terrain has no place on Earth; write .csv, .geojson or .gpkg")
+    if ending in ON_EARTH:
+        check_on_earth(path, frame)
     if ending not in AREAS and any(layer.shape == "Polygon" for layer in layers):
         raise ConfigError(f"--out {path}: {driver} has no areas; write {' or '.join(AREAS)}")
     with replacing(path) as half:

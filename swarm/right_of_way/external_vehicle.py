@@ -104,7 +104,7 @@ class ExternalVehicle:
         return () if self.host.replaced else tuple(self.host.open(self.vehicle))
 
     def counted(self, cell: int, x_m: float, y_m: float) -> int:
-        """The cell in which it counts at a place in `cell`. The line of a diagonal step passes a corner of two other
+        """The cell in which it counts at a place in `cell`. The line of a diagonal step passes a corner of two more
         cells: within `_ASIDE` of that line it is still in the cell that it leaves."""
         grid = self.host.shards.grid
         for tail, head in pairwise(self.cells) if cell not in self.cells else ():
