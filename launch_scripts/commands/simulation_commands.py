@@ -117,7 +117,8 @@ def _simulate_once(
             report = run_to_end(done, tell)
             took_s = time.perf_counter() - began_s
     if as_json:
-        typer.echo(json.dumps({name: value for name, value in report.items() if name != "by_vehicle"}, indent=2))
+        numbers = {name: value for name, value in report.items() if name != "by_vehicle"}
+        typer.echo(json.dumps(numbers, indent=2))
     else:
         terminal.report(report)
     report = with_series({**report, "run_id": folder.name}, done.recorder, done.terrain)
@@ -136,19 +137,23 @@ def simulate_seeds(name: str | None, seeds: str, seconds: float | None, as_json:
     from launch_scripts.simulation.sample_worlds import WORLDS
     from launch_scripts.simulation.trials import MIX, SECONDS, Trial, parse_seeds, replay_of, run_trial, world_of
 
-    some, name, seconds = parse_seeds(seeds), name or MIX, SECONDS if seconds is None else seconds
+    some, name = parse_seeds(seeds), name or MIX
     given = None if name in (MIX, *WORLDS) else find_scenario(name)
+    seconds = SECONDS if seconds is None else seconds
     failing, results = [], []
     for seed in some:
         trial = Trial("", world_of(name, seed), given, seed, seconds, True)
-        results.append(result := run_trial(trial))
+        result = run_trial(trial)
+        results.append(result)
         if result.broken:
             again = replay_of(trial.world, seed, seconds, SECONDS)
-            broken = [*map(str, result.broken)]
+            broken = list(map(str, result.broken))
             failing.append({"world": trial.world, "seed": seed, "broken": broken, "replay": again})
         typer.echo(f"{len(results)}/{len(some)} {_line(trial, result)}", err=as_json)
     figures = [result.figures for result in results]
-    waits_s, routed_s = (max(each.get(key, 0) for each in figures) for key in ("longest_wait_s", "routed_after_s"))
+    waits_s, routed_s = (
+        max(each.get(figure, 0.0) for each in figures) for figure in ("longest_wait_s", "routed_after_s")
+    )
     if as_json:
         total = {"seeds": len(some), "longest_wait_s": waits_s, "routed_after_s": routed_s, "failing": failing}
         typer.echo(json.dumps({**total, "results": msgspec.to_builtins(results)}, indent=2))
