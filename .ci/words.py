@@ -1,7 +1,8 @@
 """Checks the English of the product: `python .ci/words.py`, exit code 1 with a sentence per fault.
 
 - A docstring begins with a noun phrase or a verb in the third person: no word of `FIRST` begins one.
-- No word of `BANNED` occurs in a docstring, a comment or a page: the vocabulary has a term for each.
+- No word of `BANNED` occurs in a docstring, a comment, a page or the name of a test: the vocabulary has a term for
+  each.
 
 `budget.toml` holds in `[words]` how many faults each tree may still have. A row only falls.
 """
@@ -36,6 +37,12 @@ def comments(source: str) -> Iterator[tuple[int, str]]:
             yield token.start[0], token.string
 
 
+def names_of_tests(source: str) -> Iterator[tuple[int, str]]:
+    """Yields the line and the words of each test's name."""
+    for found in re.finditer(r"^ *(?:async )?def test_(\w+)", source, re.M):
+        yield source.count("\n", 0, found.start()) + 1, found[1].replace("_", " ")
+
+
 def faults_of(path: Path) -> Iterator[str]:
     """Yields a sentence per fault of a Python file or a page."""
     text = path.read_text(encoding="utf-8")
@@ -47,7 +54,7 @@ def faults_of(path: Path) -> Iterator[str]:
         for line, each in first:
             if found := FIRST.match(each.strip()):
                 yield f'{where}:{line}: a docstring begins with "{found[0]}": begin with a noun phrase or a verb'
-        texts = [*first, *comments(text)]
+        texts = [*first, *comments(text), *names_of_tests(text)]
     for line, each in texts:
         for found in BANNED.finditer(_CODE.sub("`", each)):
             yield f'{where}:{line}: "{found[0]}": the style page has a plain term for it'

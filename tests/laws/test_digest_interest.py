@@ -166,7 +166,7 @@ happenings = st.lists(
 
 
 @given(happenings)
-def test_whoever_is_listened_to_is_known_since_when(happened: list[tuple[str, str, int]]) -> None:
+def test_it_is_known_since_when_each_sender_is_heard(happened: list[tuple[str, str, int]]) -> None:
     """Against a twin that writes down at each step to whom was listened."""
     interest, now = DigestInterest("x", 1), 100
     interest.start(now)

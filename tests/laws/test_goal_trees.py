@@ -162,7 +162,7 @@ def test_who_asks_again_after_every_slice_is_answered_however_small_the_slices_a
                 left.remove((goal, start))
 
 
-def test_far_changes_and_dear_ones_beside_the_route_need_no_growth() -> None:
+def test_far_changes_and_costly_ones_beside_the_route_need_no_growth() -> None:
     pace = np.ones((60, 60), np.float32)
     ground = loaded(pace, **RULES[0])
     trees = GoalTrees(ground, 1 << 30)

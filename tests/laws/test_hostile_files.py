@@ -191,7 +191,7 @@ def test_a_terrain_that_explodes_is_refused_in_a_sentence(
     assert peak_mb < MOST_MB
 
 
-def test_a_member_that_nobody_asked_for_is_not_unpacked(tmp_path: Path, run: Run) -> None:
+def test_a_member_that_no_one_asked_for_is_not_unpacked(tmp_path: Path, run: Run) -> None:
     small = npy((8, 8), body=bytes(256))
     path = archive(tmp_path / "a.npz", elevation=small, x=300)
     code, said, peak_mb = run("terrain", "info", path, "--resolution-m", 10)

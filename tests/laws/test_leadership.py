@@ -247,7 +247,7 @@ def test_a_leader_that_keeps_stalling_leads_only_once_it_has_been_well_for_a_whi
     assert [each.rank for each in world.leaders()] == [0]
 
 
-def test_who_stalls_takes_nobody_for_dead_because_of_that() -> None:
+def test_who_stalls_takes_no_one_for_dead_because_of_that() -> None:
     world = World(9, 3, lossy=0.0)
     world.run(8 * NS_PER_S)
     before = list(world.changes)
@@ -286,7 +286,7 @@ def test_strangers_without_end_take_no_memory_and_one_lie_holds_for_a_lease_only
     assert core._others == {}
 
 
-def test_copied_heartbeats_of_the_dead_hold_nobody_back() -> None:
+def test_copied_heartbeats_of_the_dead_hold_no_one_back() -> None:
     core, chance, last = Leadership("t0.r1", 1, alone=False, period_ns=HEARTBEAT_NS), random.Random(1), 80
     for n in range(1, 1000):
         now_ns = n * HEARTBEAT_NS

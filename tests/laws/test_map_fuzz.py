@@ -131,7 +131,7 @@ def test_mutated_payloads_on_the_bus_neither_stop_a_service_nor_keep_true_marks_
     assert len(list(store.load())) == len(sets_asked(keeper.replica, MarksRequest()))
 
 
-def test_requests_for_what_nobody_has_are_answered_with_nothing() -> None:
+def test_requests_for_what_no_one_has_are_answered_with_nothing() -> None:
     replica = MapReplica(GRID)
     for each in examples():
         replica.merge([each])

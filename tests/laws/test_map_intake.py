@@ -158,7 +158,7 @@ class Searched(Watched):
         self.driven(route)
 
 
-def test_nobody_is_sent_to_look_for_a_target_through_a_change_that_waits() -> None:
+def test_no_one_is_sent_to_look_for_a_target_through_a_change_that_waits() -> None:
     routes = 0
     for seed in range(few(33)):
         watched = Searched(seed)

@@ -194,7 +194,7 @@ looks = st.tuples(st.booleans(), modes, st.sampled_from(["drive", "hold"]), st.f
 
 @settings(max_examples=few(400), deadline=None)
 @given(kinds, st.booleans(), st.lists(looks, max_size=40))
-def test_whoever_takes_the_wheel_from_us_keeps_it(
+def test_another_driver_that_takes_the_wheel_keeps_it(
     kind: tuple[int, int], guided: bool, looks: list[tuple[bool, int, str, float, float]]
 ) -> None:
     made = kind_of(codec.Beat(*kind, armed=False, mode=mav.MANUAL))

@@ -167,7 +167,7 @@ class Mended(Patchwork):
 
 
 @pytest.mark.parametrize("priced", WAYS_TO_PRICE, ids=str)
-def test_after_windows_jumps_marks_and_strides_a_mended_tree_is_a_grown_one_bit_for_bit(
+def test_after_windows_jumps_marks_and_strides_a_repaired_tree_is_a_grown_one_bit_for_bit(
     priced: dict[str, Any],
 ) -> None:
     mended = done = 0
@@ -208,7 +208,7 @@ def test_where_nothing_is_left_of_the_old_order_mending_gives_up_and_says_so() -
     assert given_up
 
 
-def test_a_tree_whose_costs_are_too_large_for_its_parents_to_be_trusted_is_not_mended() -> None:
+def test_a_tree_whose_costs_are_too_large_for_its_parents_to_be_trusted_is_not_repaired() -> None:
     pace = np.ones((30, 30), np.float32)
     pace[:, 15] = 1e9
     costs = loaded(pace)

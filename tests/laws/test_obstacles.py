@@ -126,7 +126,7 @@ pauses = st.sampled_from([TICK_NS, TICK_NS, TICK_NS, 2 * TICK_NS, 30 * TICK_NS])
 
 @settings(max_examples=few(60), deadline=None)
 @given(st.lists(st.tuples(st.lists(reports, max_size=2), pauses), min_size=1, max_size=12))
-def test_a_cell_is_closed_while_any_sender_says_so_and_open_once_nobody_does(steps) -> None:
+def test_a_cell_is_closed_while_any_sender_says_so_and_open_once_no_one_does(steps) -> None:
     obstacles, twin, now_ns = Obstacles(GRID, MARGIN_M), Twin(), 10**18
     obstacles.tick(now_ns)
     for said, pause_ns in steps:

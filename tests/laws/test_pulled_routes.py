@@ -36,7 +36,7 @@ from vehicle_agent.driving.motion import Motion
     st.booleans(),
     st.sampled_from((4, 8)),
 )
-def test_a_pulled_route_costs_its_integral_is_never_dearer_and_touches_nothing_lethal(
+def test_a_pulled_route_costs_its_integral_is_never_costlier_and_touches_nothing_lethal(
     seed: int, rows: int, cols: int, lethal: float, corner_cutting: bool, neighbours: Literal[4, 8]
 ) -> None:
     random = np.random.default_rng(seed)

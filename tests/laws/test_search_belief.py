@@ -134,7 +134,7 @@ def test_a_vehicle_that_comes_late_in_a_tick_is_told_to_ask_again_and_is_told_a_
     assert math.isfinite(searcher.route(ways, "v19", 19, 0, 0)[0].cost_s)
 
 
-def test_a_place_is_kept_while_it_is_driven_to_and_given_up_once_somebody_has_looked() -> None:
+def test_a_place_is_kept_while_it_is_driven_to_and_given_up_once_someone_has_looked() -> None:
     pace = np.full((100, 100), 0.2, np.float32)
     searcher, ways = begun(pace, costs_of(pace), 100.0, 5050, 60.0)
     route = searcher.route(ways, "v", 0, 0, 0)[0]
@@ -222,7 +222,7 @@ def test_a_target_is_never_taken_to_be_where_it_is_not_because_it_came_there_by_
 
 @settings(max_examples=25, deadline=None)
 @given(_SEEDS)
-def test_where_one_can_come_down_and_not_up_nobody_is_sent_to_where_he_stands(seed: int) -> None:
+def test_where_one_can_come_down_and_not_up_no_one_is_sent_to_where_he_stands(seed: int) -> None:
     heights = np.zeros((12, 30), np.float32)
     heights[:, 15:] = 30.0  # a step that is too steep to climb, and not to come down
     grid = GridSpec(12, 30, METRES)

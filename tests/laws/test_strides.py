@@ -170,7 +170,7 @@ def test_every_node_that_its_distance_asks_for_is_reached(seed: int, rules: dict
 
 @given(st.integers(0, 2**31), st.sampled_from(RULES))
 @settings(max_examples=12, deadline=None)
-def test_along_strides_no_route_gets_dearer_whatever_was_marked_since(seed: int, rules: dict) -> None:
+def test_along_strides_no_route_gets_costlier_whatever_was_marked_since(seed: int, rules: dict) -> None:
     ground = Ground(seed, rules)
     grid, costs = ground.costs.grid, ground.costs
     tree = CostToGoTree(costs)

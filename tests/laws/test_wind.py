@@ -84,7 +84,7 @@ def test_a_wind_is_told_by_where_it_comes_from(from_deg: float, south: float, ea
     assert wind.factor(-south, -east) == pytest.approx(12 / 9)
 
 
-def test_a_wind_in_which_nobody_makes_headway_is_refused() -> None:
+def test_a_wind_in_which_no_one_makes_headway_is_refused() -> None:
     for south, east in ((1.0, 0.0), (0.8, -0.7), (math.nan, 0.0)):
         with pytest.raises(ValueError, match="not slower"):
             Wind(south, east)
@@ -173,7 +173,7 @@ def flown_climb_s(flown: AirGround, cells: list[tuple[int, int]]) -> float:
 
 @settings(max_examples=few(60), deadline=None)
 @given(grounds, winds)
-def test_a_pulled_flight_costs_its_wind_and_its_climbs_and_is_never_dearer_than_the_route_that_it_was(
+def test_a_pulled_flight_costs_its_wind_and_its_climbs_and_is_never_costlier_than_the_route_that_it_was(
     ground: tuple[int, int, int, float], wind: Wind
 ) -> None:
     flown = flown_over(ground, wind)

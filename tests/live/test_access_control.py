@@ -382,7 +382,7 @@ def test_strangers_who_hang_up_keep_no_member_out(routed: Stage, said: bytes) ->
         each.close()
 
 
-def test_who_fails_often_is_kept_out_and_nobody_else(routed: Stage) -> None:
+def test_who_fails_often_is_kept_out_and_no_one_else(routed: Stage) -> None:
     """A handshake without a certificate from 127.0.0.3, again and again; members come from 127.0.0.1."""
     host, port = host_port(routed.endpoint)
     context = ssl.create_default_context(cafile=str(routed.folder / "ca.pem"))
@@ -408,7 +408,7 @@ def test_a_revoked_name_is_admitted_again_with_its_next_certificate(routed: Stag
     }
 
 
-def test_outside_of_the_namespace_nobody_may_do_anything(stage: Stage) -> None:
+def test_outside_of_the_namespace_no_one_may_do_anything(stage: Stage) -> None:
     endpoint = f"tls/localhost:{free_ports(1)[0]}"
     router = stage.open("router.0", "router", listen=(endpoint,))
     inside: list[str] = []

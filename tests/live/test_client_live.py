@@ -150,7 +150,7 @@ def test_a_live_vehicle_hears_routes_by_callbacks_and_streams_and_what_is_wrong_
     assert ended.wait(2.0), "leaving ends the stream"
 
 
-def test_nobody_in_the_namespace_and_no_router_are_bus_errors(live: LiveSwarm) -> None:
+def test_no_one_in_the_namespace_and_no_router_are_bus_errors(live: LiveSwarm) -> None:
     with pytest.raises(BusError, match="no process of a swarm answers in namespace 'nobody' at tcp/"):
         connect(live.endpoint, namespace="nobody", timeout_s=1.0)
     with pytest.raises(BusError, match=r"cannot reach a router at tcp/127\.0\.0\.1:1:"):
@@ -346,7 +346,7 @@ def test_vehicles_of_a_killed_process_stay_until_it_is_back_or_a_person_says_tha
         assert sentence in refused.stderr.read()
 
 
-def test_nobody_has_met_anybody(live: LiveSwarm) -> None:
+def test_no_one_has_met_anybody(live: LiveSwarm) -> None:
     live.end()
     report = json.loads((live.run_dir / "report.json").read_text())
     assert report["collisions"] == 0

@@ -74,7 +74,7 @@ def wait_until_complete(screenshot: Callable[[], bytes], folder: Path, within_s:
 
 
 @pytest.mark.skipif(CHROMIUM is None, reason="needs chromium: apt-get install chromium")
-def test_a_browser_shows_ground_targets_and_vehicles_and_asks_nobody_else(shown: Rig, tmp_path: Path) -> None:
+def test_a_browser_shows_ground_targets_and_vehicles_and_asks_no_one_else(shown: Rig, tmp_path: Path) -> None:
     assert shown.sinks.page is not None
     browser = Browser(tmp_path / "profile", SIZE)
     try:

@@ -43,7 +43,7 @@ def test_a_launcher_that_is_killed_and_started_again_with_its_run_id_goes_on_wit
         assert sets_in(store) >= before
 
 
-def test_parts_of_a_swarm_that_are_started_on_several_machines_belong_to_one_run_whoever_comes_first() -> None:
+def test_parts_of_a_swarm_that_are_started_on_several_machines_belong_to_one_run_in_any_order() -> None:
     from launch_scripts.launcher.run_options import common_run_id, with_port
 
     scenario = find_scenario("synthetic")

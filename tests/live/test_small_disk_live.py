@@ -39,7 +39,7 @@ def fill(path: Path) -> None:
             file.write(bytes(1 << 14))
 
 
-def test_a_full_disk_stops_nobody_and_all_goes_on_when_there_is_space(tmp_path: Path, disk: Path) -> None:
+def test_a_full_disk_stops_no_one_and_all_goes_on_when_there_is_space(tmp_path: Path, disk: Path) -> None:
     out, words = tmp_path / "out.txt", ("--runs", disk / "runs", "--plain")
     with Child(out, *SWARM, "up", write_scenario(tmp_path), *words, start_new_session=True) as swarm:
         swarm.wait_for("routes are served", 240)

@@ -190,7 +190,7 @@ def test_any_zenoh_session_gets_a_readable_answer(world):
     assert requests == [CostRequest(row=4, col=5)]
 
 
-def test_a_query_for_everything_is_answered_and_harms_nobody(world):
+def test_a_query_for_everything_is_answered_and_harms_no_one(world):
     """`**` fits no template: the thread that serves must survive it."""
     requests = serve_cost(world.bus("planner"))
     stranger = world.bus("stranger").session
@@ -374,7 +374,7 @@ def test_closing_takes_seconds_at_most_though_the_router_hangs_and_does_not_abor
     assert ended.returncode == 1
 
 
-def test_nobody_to_reach_is_a_sentence(world):
+def test_no_one_to_reach_is_a_sentence(world):
     network = NetworkConfig(connect=(f"tcp/127.0.0.1:{free_ports(1)[0]}",), connect_timeout_s=0.3)
     with pytest.raises(
         BusError,
@@ -398,7 +398,7 @@ def test_a_port_that_is_taken_is_a_sentence(world):
         open_bus(network, mode="router")
 
 
-def test_a_slow_reader_keeps_the_newest_and_nobody_waits(world):
+def test_a_slow_reader_keeps_the_newest_and_no_one_waits(world):
     a, b = world.bus("a"), world.bus("b")
     seen: list[int] = []
 
@@ -432,7 +432,7 @@ def test_a_slow_reader_keeps_the_newest_and_nobody_waits(world):
         *("agent/" + "a" * 5000 + "/1", "agent/a9/\u0663", "ag%ent/a9/1"),
     ],
 )
-def test_a_token_that_names_nobody_is_dropped_and_others_are_still_told(world, token):
+def test_a_token_that_names_no_one_is_dropped_and_others_are_still_told(world, token):
     a, b, stranger, box = world.bus("a"), world.bus("b"), world.bus("stranger"), Box()
     peer = Peer("agent", "a1", 7)
     b.watch_alive(box)
@@ -478,7 +478,7 @@ def test_a_question_longer_than_its_topic_allows_is_refused_before_it_waits(worl
     assert waiting == []
 
 
-def test_a_hundred_links_that_begin_with_nonsense_keep_nobody_from_joining(world, router: Router) -> None:
+def test_a_hundred_links_that_begin_with_nonsense_keep_no_one_from_joining(world, router: Router) -> None:
     place = host_port(router.endpoint)
     with contextlib.ExitStack() as links:
         for _ in range(100):

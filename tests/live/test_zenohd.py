@@ -109,7 +109,7 @@ def test_an_older_set_that_the_storage_took_for_newer_replaces_nothing_where_it_
         assert [each.seq for each in late.replica.held.of_tile(0)] == [5 * SEQ_STEP]
 
 
-def test_without_a_certificate_of_the_swarms_nobody_gets_in(tmp_path: Path) -> None:
+def test_without_a_certificate_of_the_swarms_no_one_gets_in(tmp_path: Path) -> None:
     certs, others = tmp_path / "certs", tmp_path / "others"
     issue(certs, "router", ["localhost"], 2)
     issue(others, "router", ["localhost"], 2)

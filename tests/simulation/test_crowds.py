@@ -41,7 +41,7 @@ def test_a_crowd_with_certificates_and_every_fault_flows(seed):
 
 
 @pytest.mark.seeds(4)
-def test_of_two_generations_of_one_agent_the_older_stops_until_the_younger_is_gone_and_nobody_is_met(seed):
+def test_of_two_generations_of_one_agent_the_older_stops_until_the_younger_is_gone_and_no_one_is_met(seed):
     """An agent is cut off, and started again on another machine; then the cut heals. Later that machine dies."""
     plan = FaultPlan(partitions=(Partition(5, 9, ("agent-a1",)),), twins=(Twin(8, "agent-a1"),))
     simulation = Simulation(seeded(seed), faults=plan)

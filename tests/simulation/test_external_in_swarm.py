@@ -38,7 +38,7 @@ def test_an_external_vehicle_must_not_have_the_name_of_an_agent() -> None:
     assert rover.warnings == ["a0 is an agent of this run's scenario: an external vehicle needs another name"]
 
 
-def test_vehicles_are_added_killed_found_again_and_removed_and_nobody_meets_anybody() -> None:
+def test_vehicles_are_added_killed_found_again_and_removed_and_no_one_meets_anybody() -> None:
     simulation = OrderedSimulation(seeded(4))
     simulation.run_until(3)
     group = simulation.scenario.groups[0].name

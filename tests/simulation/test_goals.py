@@ -42,7 +42,7 @@ def sent(terrain: Terrain, vehicle: str, *goals: int, **fields: str) -> SendVehi
 
 
 @pytest.mark.seeds(3)
-def test_every_vehicle_gets_to_its_place_whoever_crashes(seed: int, terrain: Terrain) -> None:
+def test_every_vehicle_gets_to_its_place_despite_any_crash(seed: int, terrain: Terrain) -> None:
     chance = random.Random(seed)
     names = ("agent-a0", "agent-a1", "keeper-0", "places-all")
     crashes = [Crash(6.0 + 10.0 * chance.random(), chance.choice(names)) for _ in range(5)]

@@ -29,7 +29,7 @@ def test_agents_listen_to_the_shards_near_their_vehicles_and_keep_every_law():
 
 
 @pytest.mark.seeds(2)
-def test_nobody_meets_where_shards_are_larger_than_regions(seed):
+def test_no_one_meets_where_shards_are_larger_than_regions(seed):
     wide = msgspec.structs.replace(WIDE, map=msgspec.structs.replace(WIDE.map, shard_regions=2))
     simulation = Simulation(seeded(seed, wide), faults=random_plan(wide, seed, SECONDS))
     laws = LawBook(simulation)

@@ -34,7 +34,7 @@ def driven(kind: str, seed: int, seconds: float, faults: bool) -> tuple[LawBook,
 
 @pytest.mark.seeds(4)
 @pytest.mark.parametrize("faults", [False, True])
-def test_no_vehicle_drives_into_a_rover_that_looks_out_for_nobody_though_messages_are_lost(seed, faults) -> None:
+def test_no_vehicle_drives_into_a_rover_that_looks_out_for_no_one_though_messages_are_lost(seed, faults) -> None:
     law, counts = driven("open" if faults else CROWDS[seed], seed, 8.0, faults)
     assert law.driven_into == []
     assert any(generation.reports for generation in law._generations.values())

@@ -87,7 +87,7 @@ def test_a_group_chases_what_it_is_told_and_then_again_all(terrain: Terrain) -> 
     assert {vehicle.target for vehicle in vehicles(simulation).values()} == {"t0", "t1"}
 
 
-def test_an_added_target_is_chased_and_a_removed_one_leaves_nobody_lost(terrain: Terrain) -> None:
+def test_an_added_target_is_chased_and_a_removed_one_leaves_no_one_lost(terrain: Terrain) -> None:
     simulation = simulated(terrain)
     laws = LawBook(simulation)
     row, col = divmod(_open(terrain), terrain.grid.cols)

@@ -48,7 +48,7 @@ def test_a_target_that_was_never_seen_is_searched_for_captured_and_searched_for_
     assert not states[VehicleState.STRANDED]
 
 
-def test_a_planner_that_begins_anew_is_told_by_agents_where_its_target_was_last() -> None:
+def test_a_planner_that_begins_again_is_told_by_agents_where_its_target_was_last() -> None:
     blind = parse_scenario(_SCENARIO.replace("sense_range_m = 40", "sense_range_m = 0.5"))
     simulation = Simulation(blind, faults=FaultPlan(crashes=(Crash(8.0, "planner-h"),)), terrain=_OPEN)
     simulation.run_until(7.0)
@@ -86,7 +86,7 @@ _STAYS_S = 6.0
 """It takes 2 s to find that a place is empty, half a second to ask, and a little for the answers."""
 
 
-def test_nobody_stays_where_a_captured_target_was_that_nobody_sees_while_it_may_chase_another() -> None:
+def test_no_one_stays_where_a_captured_target_was_that_no_one_sees_while_it_may_chase_another() -> None:
     scenario = parse_scenario(_PARTLY_HIDDEN)
     terrain = terrain_of_pace(np.full((40, 40), 0.3, np.float32), 10.0)
     simulation = Simulation(scenario, terrain=terrain)

@@ -39,7 +39,7 @@ def test_a_target_has_its_pursuers_whichever_agents_host_them(pursuers: int) -> 
     assert "agent-a1 > agent-a0 shared-costs " in log
 
 
-def test_who_does_not_ask_for_it_tells_nobody_its_costs() -> None:
+def test_who_does_not_ask_for_it_tells_no_one_its_costs() -> None:
     groups = (msgspec.structs.replace(CLUSTERED.groups[0], assignment=None),)
     _, log = run(msgspec.structs.replace(CLUSTERED, groups=groups), 3.0)
     assert " shared-costs " not in log

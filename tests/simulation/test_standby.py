@@ -155,7 +155,7 @@ def test_the_targets_go_on_from_where_they_are_and_captures_count_on(seed: int) 
     assert told - 1 <= simulation.report(24)["captures"] <= told
 
 
-def test_a_target_that_nobody_tracks_goes_on_too() -> None:
+def test_a_target_that_no_one_tracks_goes_on_too() -> None:
     [target] = SMALL.targets
     unseen = msgspec.structs.replace(target, count=1, tracker="sighted")
     scenario: Scenario = msgspec.structs.replace(STANDING_BY, targets=(unseen,))

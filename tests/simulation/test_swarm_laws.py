@@ -61,7 +61,7 @@ def test_vehicles_among_one_way_slopes_have_a_route_or_say_that_they_are_strande
     assert LawBook(simulation).run(SECONDS) == []
 
 
-def test_nothing_acknowledged_is_lost_and_nobody_collides_though_keeper_and_agents_die_again_and_again():
+def test_nothing_acknowledged_is_lost_and_no_one_collides_though_keeper_and_agents_die_again_and_again():
     keepers = [Crash(2 + 1.3 * n, "keeper-0") for n in range(8)]
     crashes = (*keepers, *(Crash(3 + 0.9 * n, f"agent-a{n % 3}") for n in range(12)))
     plan = FaultPlan(drop=0.05, duplicate=0.05, jitter_ms=20, reorder=0.05, quiet_s=16, crashes=crashes)
@@ -86,7 +86,7 @@ def test_an_agent_cut_off_enters_nothing_new_and_goes_on_when_it_is_back():
     assert laws.collisions == []
 
 
-def test_an_agent_restarted_while_cut_off_waits_until_somebody_tells_where_its_vehicles_stood():
+def test_an_agent_restarted_while_cut_off_waits_until_someone_tells_where_its_vehicles_stood():
     plan = FaultPlan(partitions=(Partition(4, 12, ("agent-a1",)),), crashes=(Crash(9, "agent-a1"),), quiet_s=16)
     simulation = Simulation(seeded(1), faults=plan)
     laws = LawBook(simulation)

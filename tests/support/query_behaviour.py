@@ -16,7 +16,7 @@ from swarm.wire.messages.traffic import Claim, Table
 from swarm.wire.topics import MARKS, RUN, TABLE
 
 
-def test_a_query_that_nobody_serves_ends_empty(world: World):
+def test_a_query_that_no_one_serves_ends_empty(world: World):
     a = world.bus("a")
     world.settle()
     assert asked(world, a, RUN, Nothing()) == [AskEnded("q", RUN, 0, None)]

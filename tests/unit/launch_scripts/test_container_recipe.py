@@ -53,7 +53,7 @@ def test_the_recipe_passes_hadolint() -> None:
     assert done.returncode == 0, done.stdout
 
 
-def test_the_image_runs_as_nobody_and_compiles_nothing(steps: list[Step]) -> None:
+def test_the_image_runs_as_no_one_and_compiles_nothing(steps: list[Step]) -> None:
     assert values(steps, "USER", 2) == ["10001:10001"]
     assert values(steps, "ENTRYPOINT", 2) == ['["swarm"]']
     (probe,) = values(steps, "HEALTHCHECK", 2)

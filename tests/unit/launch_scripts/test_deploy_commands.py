@@ -76,7 +76,7 @@ def test_what_is_there_stays_and_a_revoked_name_gets_its_next_number(
     assert changed == {revoked}
 
 
-def test_what_a_scenario_needs_and_ends_soon_is_made_anew_with_the_hosts_that_it_had(
+def test_what_a_scenario_needs_and_ends_soon_is_made_again_with_the_hosts_that_it_had(
     tmp_path: Path, scenario: Path, swarm: Swarm, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     certs = tmp_path / "certs"

@@ -115,7 +115,7 @@ def test_a_seed_makes_the_same_plan_and_ends_in_quiet():
     assert any(cut.one_way for plan in plans for cut in plan.partitions)
 
 
-def test_agents_that_nobody_can_tell_apart_have_no_second_generation():
+def test_agents_that_no_one_can_tell_apart_have_no_second_generation():
     """For a drone's agent, alone in the air, and for two on the ground, no member notes which file is the first."""
     air = (
         "\n[[classes]]\nname = 'drone'\nair = { speed_m_per_s = 10 }\n[[groups]]\nname = 'drones'\nclass = 'drone'"

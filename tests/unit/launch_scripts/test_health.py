@@ -139,7 +139,7 @@ def test_a_probe_says_what_it_could_not_reach(server: Server, capsys: pytest.Cap
         b"HTTP/1.0 200 OK\r\n\r\n" + b"[" * 100_000,
     ],
 )
-def test_whoever_answers_something_else_is_not_taken_for_a_page_of_health(reply: bytes) -> None:
+def test_another_answer_is_not_taken_for_a_page_of_health(reply: bytes) -> None:
     with socket.create_server(("127.0.0.1", 0)) as listening:
 
         def serve() -> None:

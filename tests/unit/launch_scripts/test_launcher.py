@@ -129,7 +129,7 @@ def test_who_does_not_end_when_asked_or_fails_then_is_named(
     assert sentence in swarm.stop(lambda: time.sleep(0.02))
 
 
-def test_who_has_ended_as_asked_and_does_not_leave_holds_up_nobody_and_is_no_failure(
+def test_who_has_ended_as_asked_and_does_not_leave_holds_up_no_one_and_is_no_failure(
     swarms: list[LocalSwarm], tmp_path: Path, monkeypatch: pytest.MonkeyPatch, caplog: pytest.LogCaptureFixture
 ) -> None:
     rows = [("agent", "a0", "end_and_stay"), ("keeper", "0", "end_and_stay"), ("router", "0", "quiet")]

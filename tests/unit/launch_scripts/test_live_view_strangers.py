@@ -154,7 +154,7 @@ def test_who_takes_the_stream_looks_and_who_only_knocks_does_not(sinks: Sinks) -
     assert sinks.audience() == Audience(now=0, ever=before.ever + 2)
 
 
-def test_rerun_itself_listens_where_nobody_looks(sinks: Sinks) -> None:
+def test_rerun_itself_listens_where_no_one_looks(sinks: Sinks) -> None:
     assert sinks.page.server.behind is not None
     host, port = sinks.page.server.behind
     assert host.startswith("127.")

@@ -181,7 +181,7 @@ def test_a_long_route_is_uploaded_in_parts() -> None:
     assert places(world.vehicle.missions[-1])[-1] == GRID.cell(21, 79)
 
 
-def test_a_silent_vehicle_is_asked_five_times_and_then_told_of_anew() -> None:
+def test_a_silent_vehicle_is_asked_five_times_and_then_told_of_again() -> None:
     vehicle = Autopilot(answers=False)
     world = driving(MISSION, vehicle, seconds=20.0)
     times_s = [ns / 1e9 for ns, action in world.said if isinstance(action, codec.MissionCount)]

@@ -126,7 +126,7 @@ def test_with_a_key_only_what_is_signed_by_it_is_heard() -> None:
     assert read(door, signed) == [], "said again by somebody who has heard it"
 
 
-def test_a_forged_signature_of_a_late_time_shuts_nobody_out() -> None:
+def test_a_forged_signature_of_a_late_time_shuts_no_one_out() -> None:
     door, sender = wire(key=KEY), Sender(key=KEY)
     assert len(read(door, sender.bytes_of(beat()))) == 1
     read(door, Sender(key=OTHER_KEY, at_s=NOW_S + 1e6).bytes_of(beat()))
@@ -190,7 +190,7 @@ def test_what_is_said_to_a_vehicle_has_its_number_and_the_units_of_mavlink() -> 
     assert (on_ground.type_mask, in_air.type_mask, in_air.alt) == (0x0DFC, 0x0DF8, 30.0)
 
 
-def test_to_nobody_only_heartbeats_are_said() -> None:
+def test_to_no_one_only_heartbeats_are_said() -> None:
     assert wire().write(codec.Heartbeat())
     assert wire().write(codec.MissionCount(3)) == b""
 
@@ -257,7 +257,7 @@ def test_udp_answers_the_vehicle_and_no_stranger(peer: socket.socket) -> None:
 
 
 @pytest.mark.network
-def test_udp_out_speaks_first_and_survives_that_nobody_is_there(peer: socket.socket) -> None:
+def test_udp_out_speaks_first_and_survives_that_no_one_is_there(peer: socket.socket) -> None:
     with opened(f"udpout:127.0.0.1:{peer.getsockname()[1]}") as link:
         link.write(b"hello")
         data, back = peer.recvfrom(100)

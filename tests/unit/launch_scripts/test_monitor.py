@@ -132,7 +132,7 @@ def test_who_opens_the_view_late_has_all_of_it_soon(tmp_path: Path) -> None:
         assert whole == late, entity
 
 
-def test_while_nobody_looks_half_the_frames_are_drawn_and_packed_together(tmp_path: Path) -> None:
+def test_while_no_one_looks_half_the_frames_are_drawn_and_packed_together(tmp_path: Path) -> None:
     frames, packs = {}, {}
     for name, audience in (("seen", SOMEBODY), ("unseen", NOBODY)):
         rig = Rig(SCENARIO, TERRAIN, tmp_path / name, audience=audience)
@@ -220,7 +220,7 @@ def test_a_route_that_leaves_the_map_is_counted_and_not_drawn() -> None:
     rig.close()
 
 
-def test_where_to_watch_is_told_to_whoever_begins_to_listen_later() -> None:
+def test_where_to_watch_is_told_to_those_that_begin_to_listen_later() -> None:
     rig = Rig(SCENARIO, TERRAIN, None, web_port=9090)
     rig.run(30)
     heard: list[Event] = []
@@ -290,7 +290,7 @@ def test_page_and_stream_are_served_on_loopback_only_and_cannot_call_home(tmp_pa
     assert time.monotonic() - began_s < 4
 
 
-def test_a_recording_that_finds_no_space_stops_nobody_and_goes_on_in_a_new_file(tmp_path: Path) -> None:
+def test_a_recording_that_finds_no_space_stops_no_one_and_goes_on_in_a_new_file(tmp_path: Path) -> None:
     """A limit of the size of files stands for the full disk: Rerun's sink ends at the first error all the same."""
     script = f"""
 import pathlib, resource
@@ -324,7 +324,7 @@ sinks.close()
     assert rows_by_entity(tmp_path / "run-2.rrd")["/a"] == 4
 
 
-def test_a_recording_that_begins_anew_holds_all_that_does_not_move(tmp_path: Path) -> None:
+def test_a_recording_that_begins_again_holds_all_that_does_not_move(tmp_path: Path) -> None:
     rig = Rig(SCENARIO, TERRAIN, tmp_path / "run.rrd")
     told = iter([None, tmp_path / "run-2.rrd"])
     rig.service._recording = lambda now_ns: next(told, None)

@@ -273,7 +273,7 @@ def test_a_place_outside_the_grid_is_taken_for_the_nearest_cell() -> None:
 
 
 @pytest.mark.parametrize("name", ["a0-99", "t3x", "\x1b[31m", "a0-07", "t3"])
-def test_whom_nobody_knows_the_camera_cannot_follow(name: str) -> None:
+def test_whom_no_one_knows_the_camera_cannot_follow(name: str) -> None:
     scenario = parse_scenario(f'[[targets]]\nname = "t"\ncount = 5\n[monitor]\nfollow = {json.dumps(name)}\n')
     faults = [finding.sentence for finding in network(scenario)]
     assert [fault.partition(": found")[0] for fault in faults] == ["monitor.follow"] * (name not in ("a0-07", "t3"))

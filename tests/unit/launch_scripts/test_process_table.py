@@ -32,7 +32,7 @@ def test_processes_are_chosen_by_role_and_id_and_start_in_order() -> None:
     assert [spec.name for spec in chosen] == names
 
 
-def test_the_referee_watches_also_where_somebody_else_tracks_all_targets() -> None:
+def test_the_referee_watches_also_where_someone_else_tracks_all_targets() -> None:
     scenario = Scenario(targets=(TargetConfig(walk="external"),))
     assert "targets-0" in [spec.name for spec in processes_of(scenario)]
 

@@ -113,7 +113,7 @@ def test_an_external_vehicle_is_named_until_its_lease_ends_and_the_report_names_
     assert (recorder.report()["external"], recorder.report()["external_seen"]) == ((), ["rover"])
 
 
-def test_what_nobody_told_of_is_null_and_not_zero(recorder: Recorder) -> None:
+def test_what_no_one_told_of_is_null_and_not_zero(recorder: Recorder) -> None:
     report = recorder.report()
     for name in ("seconds", "captures", "collisions", "lethal_entries", "stranded", "lost", "marks", "startup_s"):
         assert report[name] is None, name
@@ -262,7 +262,7 @@ def capture(target: str, cell: int) -> Note:
     return Note(role="targets", id="d0", stamp_ns=1, kind="capture", text="a captured it", cell=cell, target=target)
 
 
-def test_a_capture_is_placed_where_the_target_was_though_nobody_tracks_it(recorder: Recorder) -> None:
+def test_a_capture_is_placed_where_the_target_was_though_no_one_tracks_it(recorder: Recorder) -> None:
     hear(recorder, pose("t0", 100.0, 200.0, 1), at_s=1.0)
     hear(recorder, capture("t1", 3 * GRID.cols + 5), capture("t1", GRID.cells), at_s=3.0)
     (placed,) = recorder.captures

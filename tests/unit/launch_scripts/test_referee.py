@@ -220,7 +220,7 @@ def test_a_vehicle_that_crosses_the_way_on_which_an_obstacle_comes_is_at_fault()
 
 
 @pytest.mark.parametrize("lease_s", [0.0, 0.3])
-def test_an_obstacle_whose_lease_has_ended_is_met_by_nobody(lease_s: float) -> None:
+def test_an_obstacle_whose_lease_has_ended_is_met_by_no_one(lease_s: float) -> None:
     assert judged_hits(obstacle(0, 5.5, lease_s=lease_s), *on(50, 900, 4), *on(950, 2000, 5)) == []
 
 

@@ -237,7 +237,7 @@ def test_a_plan_is_put_when_it_is_new_and_at_most_once_a_second() -> None:
     assert len(puts(told(core, World({"a": vehicle("a")}), 6.0), "plan")) == 0
 
 
-def test_targets_that_nobody_tracks_are_not_told() -> None:
+def test_targets_that_no_one_tracks_are_not_told() -> None:
     seen = {id: SeenTarget(id, 300_010.0, 5_199_610.0, 0, None, lost) for id, lost in (("t0", False), ("t1", True))}
     actions = told(gateway(), World(targets=seen), 0.0)
     assert [each.channel.topic for each in actions if each.channel.row == "target_pose"] == ["/targets/t0/pose"]

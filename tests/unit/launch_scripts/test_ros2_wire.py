@@ -119,7 +119,7 @@ def test_bytes_that_are_no_message_raise_only_a_protocol_error(content: bytes, n
             types.unpack(each, name)
 
 
-def test_the_newest_message_waits_until_somebody_asks_and_is_taken_once() -> None:
+def test_the_newest_message_waits_until_someone_asks_and_is_taken_once() -> None:
     types, name = types_of("jazzy"), "std_msgs/msg/String"
     endpoint = SimpleNamespace(topic="/said", type_name=name)
     kept: list[Callable[[Any], None]] = []

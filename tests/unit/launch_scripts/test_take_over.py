@@ -107,7 +107,7 @@ EVENTS: dict[str, Callable[[Machine], object]] = {
 
 @settings(max_examples=few(200), deadline=None)
 @given(st.lists(st.sampled_from(sorted(EVENTS.keys() - {"agent answers"})), max_size=30))
-def test_nobody_is_asked_before_successors_are_ready_and_each_file_has_one_writer(
+def test_no_one_is_asked_before_successors_are_ready_and_each_file_has_one_writer(
     history: list[str],
 ) -> None:
     with pytest.MonkeyPatch.context() as patch:
@@ -171,7 +171,7 @@ def test_an_agent_whose_generation_before_crashed_is_waited_for_no_longer(machin
     assert machine.asked == [(LAUNCHER, signal.SIGTERM)]
 
 
-def test_a_launcher_that_was_killed_is_followed_and_nobody_is_signalled(machine: Machine) -> None:
+def test_a_launcher_that_was_killed_is_followed_and_no_one_is_signalled(machine: Machine) -> None:
     machine.alive = {PREDECESSORS["router-0"]}  # it has not noticed yet
     machine.turn()
     assert machine.asked == []
@@ -191,7 +191,7 @@ def test_a_launcher_that_was_killed_is_followed_and_nobody_is_signalled(machine:
         ([LAUNCHER], "runs agent-a1 too, which this one would end and not start again"),
     ],
 )
-def test_where_there_is_nobody_to_follow_or_two_or_a_role_would_be_lost_it_is_refused_in_a_sentence(
+def test_where_there_is_no_one_to_follow_or_two_or_a_role_would_be_lost_it_is_refused_in_a_sentence(
     launchers: list[int], says: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(takeover, "writing", lambda _: launchers)

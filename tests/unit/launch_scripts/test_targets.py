@@ -180,7 +180,7 @@ def test_in_a_run_that_begins_all_targets_are_placed_at_once() -> None:
     assert sorted(world.poses()) == ["s", "t0", "t1"]
 
 
-def test_where_targets_may_start_is_the_same_whoever_found_it() -> None:
+def test_where_targets_may_start_is_the_same_for_every_finder() -> None:
     pace = flat()
     pace[:, 30] = np.inf
     plan, terrain = scenario(TargetConfig(count=9)), terrain_of_pace(pace, RES)
@@ -195,7 +195,7 @@ def test_where_targets_may_start_is_the_same_whoever_found_it() -> None:
     assert poses[0] == poses[1] != poses[2]
 
 
-def test_nonsense_from_a_planner_places_nobody() -> None:
+def test_nonsense_from_a_planner_places_no_one() -> None:
     pace = flat()
     pace[0, 0] = np.inf
     home = World(TargetConfig(), pace=pace).poses

@@ -91,7 +91,7 @@ def test_the_largest_part_is_what_legal_steps_connect() -> None:
     assert terrain(pace).home.tolist() == [0, 1, 6, 7, 8, 12, 13, 14, 18, 19, 20]
 
 
-def test_nobody_squeezes_past_the_corner_of_a_lethal_cell() -> None:
+def test_no_one_squeezes_past_the_corner_of_a_lethal_cell() -> None:
     pace = flat(2, 2)
     pace[0, 1] = np.inf
     assert terrain(pace).step(0, 3) is None

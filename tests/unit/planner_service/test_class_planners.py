@@ -236,7 +236,7 @@ def test_while_its_kernels_are_compiled_a_class_is_refused_at_once_and_those_tha
     assert (reply.vehicle_class, world.trees()) == ("drone", ["ground", "walker", "drone"])
 
 
-def test_nobody_waits_for_the_tree_of_another_class() -> None:
+def test_no_one_waits_for_the_tree_of_another_class() -> None:
     world = _World()
     ended: list[str] = []
 

@@ -178,7 +178,7 @@ def test_a_planner_starts_with_its_first_kernels_and_has_all_once_the_last_is_th
     assert loader.complete
 
 
-def test_nobody_starts_builders_where_some_are_at_work(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_one_starts_builders_where_some_are_at_work(monkeypatch: pytest.MonkeyPatch) -> None:
     disk = Disk(monkeypatch)
     disk.building = True
     needed = needed_kernels(scenario())

@@ -101,7 +101,7 @@ def _one_wrong_byte(data: bytes) -> bytes:
     return data[:middle] + bytes([data[middle] ^ 0xFF]) + data[middle + 1 :]
 
 
-def test_files_that_are_not_as_they_were_written_are_written_anew(folder: Path) -> None:
+def test_files_that_are_not_as_they_were_written_are_written_again(folder: Path) -> None:
     damages: list[tuple[str, Callable[[bytes], bytes]]] = [
         ("*.nbi", lambda data: b""),
         ("*.nbi", lambda data: data[: len(data) // 2]),

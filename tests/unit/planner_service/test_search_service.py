@@ -87,7 +87,7 @@ def test_vehicles_of_different_classes_search_by_one_belief_each_on_its_own_grou
     assert math.hypot(rows[1] - rows[0], cols[1] - cols[0]) * world.ground.grid.resolution_m > 120.0
 
 
-def test_a_planner_that_begins_anew_searches_from_an_earlier_sighting_that_it_is_told_again() -> None:
+def test_a_planner_that_begins_again_searches_from_an_earlier_sighting_that_it_is_told_again() -> None:
     world = World()
     world.run(7)
     search = world.service._planner.target_search
@@ -132,7 +132,7 @@ def test_a_planner_tells_what_it_believes_while_it_searches_and_once_that_it_doe
     assert len(heard) == many
 
 
-def test_a_class_is_answered_from_the_search_at_once_where_nobody_has_seen_the_target() -> None:
+def test_a_class_is_answered_from_the_search_at_once_where_no_one_has_seen_the_target() -> None:
     """No tree is about to be grown, so that there is nothing to wait for but that the class takes in the map."""
     world = World()
     world.run(2)

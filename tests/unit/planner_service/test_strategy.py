@@ -187,7 +187,7 @@ def dear_tree(full_ns: int) -> GrowthTimes:
     return times
 
 
-def test_auto_keeps_a_dear_tree_exact_for_a_target_that_moves_seldom() -> None:
+def test_auto_keeps_a_costly_tree_exact_for_a_target_that_moves_seldom() -> None:
     for every, stage in ((20, strategies.OnMove.EXACT_MOVE), (1, strategies.OnMove.SCHEDULED_WINDOW)):
         times = dear_tree(150_000_000)
         for tick in range(200):

@@ -171,7 +171,7 @@ def test_a_keeper_with_another_terrain_is_passed_over() -> None:
     assert same(fetched(network), TERRAIN)
 
 
-def test_nobody_there_is_one_sentence_within_the_deadline() -> None:
+def test_no_one_there_is_one_sentence_within_the_deadline() -> None:
     with pytest.raises(TerrainError) as caught:
         fetched(Network(), why="there is no file ridge.tif", within_s=0.3)
     assert str(caught.value) == (

@@ -297,7 +297,7 @@ def test_tiles_do_not_show(monkeypatch: pytest.MonkeyPatch) -> None:
         assert several.all()
 
 
-def test_a_doubted_cell_costs_what_the_dearest_of_its_readings_does() -> None:
+def test_a_doubted_cell_costs_what_the_costliest_of_its_readings_does() -> None:
     grass, forest, rock = (BIT[kind] for kind in (TerrainClass.GRASS, TerrainClass.FOREST, TerrainClass.ROCK))
     factors = doubt_factors(CostConfig())
     assert factors[0] == factors[BIT[TerrainClass.UNKNOWN]] == 1

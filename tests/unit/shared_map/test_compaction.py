@@ -202,7 +202,7 @@ def test_tombstones_give_way_to_what_is_newer_and_are_forgotten_in_time() -> Non
     assert len(tombstones) == 0
 
 
-def test_nobody_is_taken_for_dead_before_a_keeper_has_listened_long_enough() -> None:
+def test_no_one_is_taken_for_dead_before_a_keeper_has_listened_long_enough() -> None:
     replica = MapReplica(GRID)
     replica.merge([set_of("a", 0, 1, {1: (LETHAL, 0, 1)}), set_of("b", 3, 1, {1: (LETHAL, 0, 1)})])
     plan = CompactionPlan(10, started_ns=100)

@@ -169,7 +169,7 @@ def test_few_authors_are_named_whichever_names_come_later(monkeypatch: pytest.Mo
         assert len(keeper._named) == min(50 - n, _NAME_AT_MOST)
 
 
-def test_a_loud_author_is_named_and_late_but_loses_nothing_and_holds_nobody_up() -> None:
+def test_a_loud_author_is_named_and_late_but_loses_nothing_and_holds_no_one_up() -> None:
     swarm = SwarmModel(scenario=Scenario(map=MapConfig(author_marks_per_s=20)))
     keeper = swarm.keeper("keeper", KeeperStore(":memory:"))
     keeper._sync._quota = Quota(20)

@@ -52,7 +52,7 @@ def test_a_set_that_is_no_part_of_the_grid_is_told_apart_by_its_values_alone(mar
     assert (fault(mark_set, GRID) or "").startswith(reason)
 
 
-def test_whoever_knows_a_statement_from_the_future_can_overrule_it_at_once() -> None:
+def test_a_replica_that_knows_a_statement_from_the_future_can_overrule_it_at_once() -> None:
     clock = HybridClock()
     assert clock.stamps_ns(100, np.array([NO_STATEMENT, 50, 5_000])).tolist() == [100, 100, 5_001]
     assert clock.stamps_ns(90, np.array([NO_STATEMENT])).tolist() == [100]  # never backwards

@@ -87,7 +87,7 @@ def test_of_a_cell_named_twice_the_last_statement_counts() -> None:
     assert (composite.kinds[5], composite.paces[5]) == (PACE, 3.0)
 
 
-def test_clear_undoes_an_older_lethal_of_somebody_whose_clock_is_ahead() -> None:
+def test_clear_undoes_an_older_lethal_of_someone_whose_clock_is_ahead() -> None:
     replica, composite = writer()
     replica.merge([set_of("zz", 0, 0, {5: (LETHAL, 0, NOW + 3600 * NS_PER_S)})])
     replica.write([5], [CLEAR], [0], NOW)

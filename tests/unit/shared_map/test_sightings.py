@@ -67,7 +67,7 @@ def test_a_sighting_ends_by_itself_and_the_next_best_counts() -> None:
     assert seen.best(20) == {}
 
 
-def test_an_author_with_a_fast_clock_outweighs_nobody_and_its_sightings_expire_all_the_same() -> None:
+def test_an_author_with_a_fast_clock_outweighs_no_one_and_its_sightings_expire_all_the_same() -> None:
     seen, hour_ns = Sightings(MarkFilter(GRID)), 3600 * NS_PER_S
     assert seen.receive(sighted(hour_ns, author="red.a0.1", cell=1, until_ns=2 * hour_ns), NS_PER_S)
     assert seen.best(NS_PER_S)["t"].cell == 1
@@ -103,7 +103,9 @@ def test_a_vehicle_tells_of_targets_in_range_and_how_sure_it_is() -> None:
     assert len(detector.detect(Places(GRID, [near]), 500_000_000)) == 1
 
 
-def test_a_planner_that_begins_anew_is_told_the_last_sighting_by_whoever_had_it_unless_it_was_a_capture() -> None:
+def test_a_planner_that_begins_again_is_told_the_last_sighting_by_the_one_that_had_it_unless_it_was_a_capture() -> (
+    None
+):
     detector = TargetDetector(GRID, "red.a0.1", "red", 100.0, MarkFilter(GRID), set())
     near = Places(GRID, [Vehicle("v", GRID, GRID.cell(10, 15))])
 
@@ -143,7 +145,7 @@ UNTRACKED = msgspec.structs.replace(
 )
 
 
-def test_a_sighting_that_ended_on_its_way_tells_nobody_anything() -> None:
+def test_a_sighting_that_ended_on_its_way_tells_no_one_anything() -> None:
     blind = msgspec.structs.replace(UNTRACKED.vehicles, sense_range_m=0.1)
     simulation = Simulation(msgspec.structs.replace(UNTRACKED, vehicles=blind))
     simulation.run_until(1)

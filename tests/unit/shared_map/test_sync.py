@@ -97,7 +97,7 @@ def test_a_lost_set_is_fetched_after_the_next_digest_and_nothing_else_is() -> No
 
 
 @pytest.mark.parametrize("part_bytes", [200, replica_sync._PART_BYTES])
-def test_what_the_keeper_missed_of_the_dead_is_given_to_it_by_whoever_heard_it(part_bytes, monkeypatch):
+def test_what_the_keeper_missed_of_the_dead_is_given_to_it_by_those_that_heard_it(part_bytes, monkeypatch):
     """The keeper's digest goes out whole, or in parts of three rows."""
     monkeypatch.setattr(replica_sync, "_PART_BYTES", part_bytes)
     links = LossyLinks(3)
@@ -164,7 +164,7 @@ def test_keepers_without_end_have_few_sets_put_again(swarm: SwarmModel) -> None:
     assert 0 < len(put) <= 4 * replica_sync._OFFERS_AT_ONCE
 
 
-def test_nobody_speaks_under_anothers_key(swarm: SwarmModel) -> None:
+def test_no_one_speaks_under_anothers_key(swarm: SwarmModel) -> None:
     listener = swarm.listener("p")
     liar = swarm.network.bus("liar")
     liar.publish(MARKS, set_of("a1.1", 0, 1, {5: (LETHAL, 0, 1)}), region=0, tile=0, author="liar")
@@ -174,7 +174,7 @@ def test_nobody_speaks_under_anothers_key(swarm: SwarmModel) -> None:
     assert listener.replica.counts["sets_refused"] == 2
 
 
-def test_nobody_speaks_for_another_in_an_answer_of_many_sets_either(swarm: SwarmModel) -> None:
+def test_no_one_speaks_for_another_in_an_answer_of_many_sets_either(swarm: SwarmModel) -> None:
     liar = swarm.network.bus("liar")
     [lies] = packed([set_of("a1.1", tile, 9, {5: (LETHAL, 0, 1)}) for tile in range(3)])
     [truth] = packed([set_of("liar", 1, 1, {6: (LETHAL, 0, 1)})])

@@ -83,7 +83,7 @@ def test_the_code_is_all_that_makes_terrain(tmp_path: Path) -> None:
 
 @pytest.mark.parametrize("name", ["pace.npy", "homes.npy", "terrain.json"])
 @pytest.mark.parametrize("damage", ["a byte", "cut", "gone", "not ours"])
-def test_a_damaged_terrain_is_made_anew_and_that_is_said(tmp_path, cache, built, caplog, name, damage):
+def test_a_damaged_terrain_is_made_again_and_that_is_said(tmp_path, cache, built, caplog, name, damage):
     first, _ = prepare(tmp_path / "one", SMALL)
     digest = first.digest
     (folder,) = cache.iterdir()

@@ -9,7 +9,7 @@ OPERATIONS = ("put", "serve", "ask", "hear")
 
 
 @pytest.mark.parametrize("topic", TOPICS, ids=lambda topic: topic.name)
-def test_somebody_may_do_all_that_a_topic_is_for_and_nobody_what_it_is_not(topic) -> None:
+def test_someone_may_do_all_that_a_topic_is_for_and_no_one_what_it_is_not(topic) -> None:
     granted = {name: {grant.role for grant in getattr(topic.access, name)} for name in OPERATIONS}
     assert bool(granted["put"]) == bool(granted["hear"]) == topic.published
     assert bool(granted["serve"]) == bool(granted["ask"]) == (topic.request is not None)

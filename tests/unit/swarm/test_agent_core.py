@@ -88,7 +88,7 @@ def test_a_replaced_generation_finds_the_shards_that_keep_its_cells_shut_and_say
     assert (told.standing.shard, told.standing.ended) == (0, True)
 
 
-def test_whoever_waits_in_a_shard_without_a_leader_says_so() -> None:
+def test_a_vehicle_that_waits_in_a_shard_without_a_leader_says_so() -> None:
     rights = rights_of("a0")
     rights.begin(0)
 

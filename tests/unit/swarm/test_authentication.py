@@ -55,7 +55,7 @@ def secret(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     return tmp_path / "terrain-swarm" / "secret"
 
 
-def test_processes_that_begin_at_once_share_one_secret_that_nobody_else_may_read(secret: Path) -> None:
+def test_processes_that_begin_at_once_share_one_secret_that_no_one_else_may_read(secret: Path) -> None:
     made: list[bytes] = []
 
     def begin() -> None:

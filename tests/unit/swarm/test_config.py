@@ -105,7 +105,7 @@ def test_loopback_needs_no_certificates_and_elsewhere_does():
     assert "quic/ is not offered, as strangers" in refusal(f"[network]\nlisten = ['quic/0.0.0.0:7447']\n{tls}")
 
 
-def test_agents_take_so_many_vehicles_each_and_one_group():
+def test_agents_take_the_stated_number_of_vehicles_each_and_one_group():
     scenario = parse_scenario(
         "[vehicles]\nper_agent = 4\n[[groups]]\nname = 'a'\nvehicles = 6\n[[groups]]\nname = 'b'\nvehicles = 4"
     )

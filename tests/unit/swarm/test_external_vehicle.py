@@ -179,7 +179,9 @@ def test_no_external_vehicle_and_not_all_together_take_all_cells(monkeypatch: py
     assert held[-1] == 3
 
 
-def test_a_shard_knows_so_many_external_vehicles_and_says_whom_it_refuses(monkeypatch: pytest.MonkeyPatch) -> None:
+def test_a_shard_knows_a_bounded_number_of_external_vehicles_and_says_which_it_refuses(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
     monkeypatch.setattr(leaders, "MOST_EXTERNALS", 2)
     leader = leader_of(hosts={"a1": (1, 1), "r0": (1, 1)})
     for n in (1, 2, 0, 1):

@@ -180,7 +180,7 @@ def test_systemd_is_told_when_a_loop_is_up_turns_and_ends(manager: socket.socket
     assert words == ["STOPPING=1"]
 
 
-def test_a_manager_that_reads_nothing_holds_nobody_up_and_hears_of_the_start_later(manager: socket.socket) -> None:
+def test_a_manager_that_reads_nothing_holds_no_one_up_and_hears_of_the_start_later(manager: socket.socket) -> None:
     supervisor = Supervisor(manager.getsockname(), limit_ns=4)
     fill(manager)
     began_s = time.monotonic()

@@ -56,7 +56,7 @@ def test_the_turn_of_a_process_that_is_killed_ends(tmp_path: Path) -> None:
             assert 0.1 < time.monotonic() - began_s < 20
 
 
-def test_nobody_waits_for_ever_for_one_that_is_stopped_and_short_jobs_not_at_all(tmp_path: Path) -> None:
+def test_no_one_waits_for_ever_for_one_that_is_stopped_and_short_jobs_not_at_all(tmp_path: Path) -> None:
     entered = []
     with JobSlots(tmp_path, most=1).one():
         with JobSlots(tmp_path, most=1, longest_s=0.1).one():
@@ -66,7 +66,7 @@ def test_nobody_waits_for_ever_for_one_that_is_stopped_and_short_jobs_not_at_all
     assert entered == ["after a while", "at once"]
 
 
-def test_a_folder_that_cannot_be_written_keeps_nobody_from_work(tmp_path: Path) -> None:
+def test_a_folder_that_cannot_be_written_keeps_no_one_from_work(tmp_path: Path) -> None:
     file = tmp_path / "no-folder"
     file.touch()
     with JobSlots(file).one(), JobSlots(None).one():

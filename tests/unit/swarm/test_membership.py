@@ -127,7 +127,7 @@ def test_who_meets_only_after_a_cut_heals_is_checked_then(world):
     assert LinkChanged(True) in other.rest
 
 
-def test_who_sees_a_router_appear_compares_anew_but_does_not_take_its_own_link_to_be_up(world):
+def test_who_sees_a_router_appear_compares_again_but_does_not_take_its_own_link_to_be_up(world):
     node = Node(world)
     node.join()
     routers, questions = world.bus("r"), []
@@ -160,7 +160,7 @@ def test_counters_are_told_once_a_second_and_at_the_end():
     assert sum(last.histograms["tick_ms"].values()) == 1
 
 
-def test_once_somebody_has_confirmed_a_process_no_false_answer_ends_it_and_the_stranger_is_named_once():
+def test_once_someone_has_confirmed_a_process_no_false_answer_ends_it_and_the_stranger_is_named_once():
     world, notes = SwarmModel(), []
     world.bus("watcher").subscribe(NOTE, notes.append)
     nodes = [Node(world, id=id) for id in ("t0", "t1")]

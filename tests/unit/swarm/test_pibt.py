@@ -48,7 +48,9 @@ def test_one_that_is_pushed_does_not_go_where_the_first_of_those_that_push_stand
     assert planned(first, second, Mover("third", 2, [0], 1, age=1)) == {"first": 0, "second": 1, "third": 2}
 
 
-def test_whoever_wants_into_another_shard_waits_for_its_leader_and_one_that_is_pushed_makes_way_within() -> None:
+def test_a_vehicle_that_wants_into_another_shard_waits_for_its_leader_and_one_that_is_pushed_makes_way_within() -> (
+    None
+):
     waits = Mover("waits", 1, [99, 2], 2, age=9)
     assert planned(waits, inside=lambda cell: cell < 50) == {"waits": 1}
     pushes = Mover("pushes", 0, [1], 1, age=9)

@@ -111,7 +111,7 @@ def test_what_cannot_be_found_or_made_or_does_not_fit_is_refused_in_one_sentence
     assert "\n" not in str(refused.value)
 
 
-def test_a_name_that_nobody_offers_is_refused_when_the_scenario_is_read() -> None:
+def test_a_name_that_no_one_offers_is_refused_when_the_scenario_is_read() -> None:
     with pytest.raises(ConfigError, match=r"targets\[1\]\.walk: found 'evad'; did you mean 'evade'\? Allowed: 'st"):
         parse_scenario("[[targets]]\nname = 'a'\n[[targets]]\nwalk = 'evad'")
     for key in ("[vehicles]\nsensor", "[vehicles]\nassignment", "[vehicles]\ndynamics", "[planner]\nstrategy"):

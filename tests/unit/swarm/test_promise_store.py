@@ -162,7 +162,7 @@ def test_a_file_that_is_none_of_ours_is_refused_in_words(tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize(("shards", "grows"), [(3, False), (300, True)])
-def test_a_file_that_is_full_is_written_anew_and_grows_for_what_counts_only(tmp_path, monkeypatch, shards, grows):
+def test_a_file_that_is_full_is_written_again_and_grows_for_what_counts_only(tmp_path, monkeypatch, shards, grows):
     monkeypatch.setattr(promise_store, "_SIZE_BYTES", 3000)
     path = tmp_path / "promises-a0"
     store = FilePromiseStore(path)

@@ -106,7 +106,7 @@ def test_a_grid_whose_larger_shards_have_no_numbers_is_refused() -> None:
         Shards(grid, (), 3 * REGION_CELLS)
 
 
-def test_an_agent_with_a_wrong_size_that_nobody_built_on_may_start_again_with_the_right_one() -> None:
+def test_an_agent_with_a_wrong_size_that_no_one_built_on_may_start_again_with_the_right_one() -> None:
     spawns = {agent: {f"{agent}-00": n} for n, agent in enumerate(("a0", "a1", "a2"))}
     wrong = RightOfWay("a0", Shards(GRID, list(spawns), LARGE), spawns, OwnRecord(disk=1), {})
     (own,) = wrong.begin(5)

@@ -221,7 +221,7 @@ def test_all_vehicles_start_on_different_passable_cells_of_one_part(seed: int, s
     assert [len(vehicles) for vehicles in spawns.values()] == [7, 7, 7, 7, 2]
 
 
-def test_nobody_starts_on_an_island_or_on_what_is_lethal_in_truth() -> None:
+def test_no_one_starts_on_an_island_or_on_what_is_lethal_in_truth() -> None:
     prior, truth = LEVEL.copy(), LEVEL.copy()
     prior[:, 3] = np.inf  # three columns of 36 cells are cut off
     truth[:, 8] = np.inf

@@ -46,7 +46,7 @@ def test_a_crowd_fits_around_its_target(seed: int) -> None:
     world.arrive(120)
 
 
-def test_whoever_has_arrived_in_a_corridor_moves_up_for_those_behind() -> None:
+def test_a_vehicle_that_has_arrived_in_a_corridor_moves_up_for_those_behind() -> None:
     corridor = ["#" * 16, "#" + "." * 14 + "#", "#" * 16]
     text = scenario(3, [(1, 5), (1, 3), (1, 1)], per_agent=1, capture=30.0)
     world = AgentWorld(text, pace_of(corridor)).begin(t=(1, 12))
@@ -66,7 +66,7 @@ def maze(seed: int, size: int = 14) -> list[str]:
 
 
 @pytest.mark.seeds(1)
-def test_in_a_crowded_maze_nobody_is_stuck_for_long(seed: int) -> None:
+def test_in_a_crowded_maze_no_one_is_stuck_for_long(seed: int) -> None:
     chance = random.Random(seed)
     text = scenario(24, per_agent=6, capture=15.0).replace('name = "t"\n', 'name = "t"\ncount = 3\n')
     world = AgentWorld(text, pace_of(maze(seed)), links=LossyLinks(seed, dropped=0.05, repeated=0.1, jitter_ms=150))

@@ -77,7 +77,7 @@ def plugged(made: object, told: list[str]) -> Assigner:
 
 
 @given(problems())
-def test_no_target_gets_more_than_its_even_share_and_nobody_a_target_out_of_reach(world):
+def test_no_target_gets_more_than_its_even_share_and_no_one_a_target_out_of_reach(world):
     costs_s, current = world
     targets, vehicles = costs_s.shape
     chosen = spread(costs_s, current)
@@ -345,7 +345,7 @@ def test_a_vehicle_that_an_operator_lets_stand_is_no_pursuer() -> None:
     assert two.chased("a0") == ["t0", "t1"]
 
 
-def test_a_target_that_nobody_can_reach_is_left_out_and_one_that_only_others_know_is_not() -> None:
+def test_a_target_that_no_one_can_reach_is_left_out_and_one_that_only_others_know_is_not() -> None:
     two = Two({"a0": [[10.0, 12.0], [math.inf, math.inf]], "a1": [[9.0, 16.0], [50.0, math.inf]]})
     for n in range(2):
         two.reassign("a1", 2 * n * PERIOD_NS)
@@ -363,7 +363,7 @@ def test_of_two_generations_of_an_agent_the_one_that_spoke_last_counts_and_none_
     assert costs.rows(["t0"])[1].tolist() == [[6.0]]
 
 
-def test_however_many_agents_strangers_invent_only_so_many_are_kept() -> None:
+def test_of_the_agents_that_strangers_invent_a_bounded_number_is_kept() -> None:
     costs = GroupCosts("all.a0.1", "all", "a0")
     for n in range(1000):
         costs.receive(told(f"all.b{n}.1", 5.0, stamp_ns=n), n)

@@ -134,7 +134,7 @@ class Place:
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_whatever_changes_the_wishes_that_are_kept_are_those_that_would_be_made_anew(seed):
+def test_whatever_changes_the_wishes_that_are_kept_are_those_that_would_be_made_again(seed):
     place = Place(seed)
     wishes, kept = place.wishes, 0
     for _ in range(300):

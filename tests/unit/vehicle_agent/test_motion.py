@@ -105,7 +105,7 @@ def test_a_diagonal_step_is_longer_and_heads_south_east() -> None:
     assert motion.heading_rad == pytest.approx(0.75 * math.pi)
 
 
-def test_nobody_sets_out_for_a_cell_that_is_no_neighbour() -> None:
+def test_no_one_sets_out_for_a_cell_that_is_no_neighbour() -> None:
     with pytest.raises(ValueError, match="no step"):
         Motion(GRID, 9).set_out(10)
 

@@ -130,7 +130,7 @@ LIES = st.tuples(
 @given(st.sampled_from([0.5, 0.7, 1.0, 10.0]), st.booleans(), st.lists(LIES, max_size=60))
 @example(0.5, False, [(1, row, col, 25.0, 0.0, 10.0, None) for row in (60, 300) for col in (60, 300)])
 @settings(max_examples=50)
-def test_one_id_closes_half_of_the_cells_at_most_and_crowds_nobody_out(resolution_m, is_crowded, lies) -> None:
+def test_one_id_closes_half_of_the_cells_at_most_and_crowds_no_one_out(resolution_m, is_crowded, lies) -> None:
     """Also by the first report, by one that grows, and by leaps."""
     obstacles, now_ns = Obstacles(GridSpec(400, 400, resolution_m)), NOW
     everywhere = [(99 + n, n // 20 * 20.0, n % 20 * 20.0, 50.0, 0.0, 10.0, None) for n in range(400)]
@@ -160,7 +160,7 @@ def test_a_stopped_process_forgets_no_obstacle_in_the_time_in_which_it_did_not_l
     assert not obstacles.is_deaf
 
 
-def test_whoever_has_just_begun_to_listen_drives_when_every_obstacle_has_had_time_to_speak(obstacles):
+def test_an_agent_that_has_just_begun_to_listen_drives_when_every_obstacle_has_had_time_to_speak(obstacles):
     assert not obstacles.is_deaf
     obstacles.listen_anew(NOW)
     for tick in range(10):
@@ -294,7 +294,7 @@ def test_a_target_closes_its_cell_and_those_that_it_drives_to(made, obstacles):
     assert closed(obstacles) == {(5, 4), (5, 5)}
 
 
-def test_a_captured_target_that_jumps_leaves_its_old_place_open_and_nobody_is_told_that_it_leaps(made, obstacles):
+def test_a_captured_target_that_jumps_leaves_its_old_place_open_and_no_one_is_told_that_it_leaps(made, obstacles):
     for number, (col, jumps) in enumerate(((3.5, 0), (15.5, 1))):
         for obstacle in made.obstacles_of(pose(col, jumps=jumps), NOW + number * NS_PER_S // 5):
             obstacles.take_report(obstacle, NOW + number * NS_PER_S // 5)

@@ -150,7 +150,7 @@ def pushed(*cells: int, partial: bool = False) -> Callable[[Vehicle], object]:
         (run_out, Reason.RAN_OUT, 0),
     ],
 )
-def test_whoever_needs_another_route_asks_and_drives_on_what_it_has(follower, happen, reason, left):
+def test_a_vehicle_that_needs_another_route_asks_and_drives_on_what_it_has(follower, happen, reason, left):
     happen(follower)
     assert follower.route_request(3 * S) is reason
     state = VehicleState.FOLLOWING if left else VehicleState.WAITING

@@ -42,7 +42,7 @@ class ClosedWorld(AgentWorld):
         self._inside = inside
 
 
-def test_vehicles_drive_out_of_a_zone_and_nobody_drives_in() -> None:
+def test_vehicles_drive_out_of_a_zone_and_no_one_drives_in() -> None:
     inside = [(row, col) for row in (7, 8, 9, 10) for col in (7, 8, 9, 10)]
     world = ClosedWorld(scenario(len(inside), inside, per_agent=4, capture=15.0), pace_of(OPEN)).begin(t=(9, 9))
     world.run(3.0)
