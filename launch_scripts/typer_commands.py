@@ -84,6 +84,8 @@ class Command(TyperCommand):
     win without a word."""
 
     def parse_args(self, ctx: Any, args: list[str]) -> list[str]:
+        if ctx.resilient_parsing:  # at completion
+            return super().parse_args(ctx, args)
         given: list[Any] = self.make_parser(ctx).parse_args(args=list(args))[2]
         once = [each for each in given if each.param_type_name == "option" and not (each.multiple or each.is_flag)]
         if twice := next((each for each in once if once.count(each) > 1), None):

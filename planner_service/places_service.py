@@ -184,7 +184,8 @@ class _ClassTrees:
             walked += 1 + len(answer.route.directions)
             question.found.append(answer.route)
             question.lethal_goal = answer.lethal_goal
-            question.nearest = self.trees.costs.nearest_open(request.to) if answer.lethal_goal else None
+        near = question.done and question.lethal_goal
+        question.nearest = self.trees.costs.nearest_open(request.to) if near else None
         return grown
 
     def status(self, question: _Question) -> PlaceStatus:

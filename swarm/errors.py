@@ -87,4 +87,5 @@ class ProtocolError(SwarmError):
 
 
 class OutsideGridError(ArgumentError):
-    """A cell outside the grid where one inside it is required."""
+    """A cell outside the grid where one inside it is required: in a process of the swarm a bug, as every
+    `ArgumentError` there."""

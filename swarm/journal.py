@@ -29,7 +29,7 @@ from collections.abc import Callable, Iterable
 from contextlib import suppress
 from hashlib import blake2b
 from pathlib import Path
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 from swarm.config.input_files import FileKind, read_bytes
 from swarm.errors import DamagedError, StoreError, SwarmError
@@ -82,11 +82,12 @@ def read_seal(data: bytes, kind: str) -> Seal | None:
 class OwnFiles:
     """Files that this process alone writes, as it left them: by device, inode, size and time of change.
 
-    what  begins a sentence about one of them
+    what   begins a sentence about one of them
+    found  what became of one since, as a sentence
     """
 
     def __init__(self, what: str, *paths: Path) -> None:
-        self._what, self._paths = what, paths
+        self._what, self._paths, self.found = what, paths, ""
         self._left: dict[Path, _State] = {}
 
     def leave(self, *, new: bool = False) -> None:
@@ -99,21 +100,19 @@ class OwnFiles:
             if now is not None and (new or now[0] == self._left.get(path, now)[0]):
                 self._left[path] = now
 
-    def check(self, *, in_memory: bool) -> bool:
-        """Returns True if the files are as they were left, False if all has to be written again. Raises
-        DamagedError where a file has another content, or its name belongs to another one, perhaps of a process.
-
-        in_memory  what a changed file had is in memory, too
-        """
+    def check(self) -> Literal["", "deleted", "changed"]:
+        """What became of a file since it was left; a changed one may have the same content. Raises DamagedError
+        where its name belongs to another file, perhaps of a process."""
         for path, left in self._left.items():
             if (now := _state(path)) == left:
                 continue
-            how = "deleted" if now is None else "changed" if now[0] == left[0] else "replaced"
-            if how == "replaced" or (how == "changed" and not in_memory):
-                raise DamagedError(f"{self._what}{path} was {how} by another program while it was in use")
-            log.warning("%s%s was %s while it was in use: it is written again", self._what, path, how)
-            return False
-        return True
+            self.found = f"{self._what}{path} was %s by another program while it was in use"
+            if now is not None and now[0] != left[0]:
+                raise DamagedError(self.found % "replaced")
+            how: Literal["deleted", "changed"] = "deleted" if now is None else "changed"
+            self.found %= how
+            return how
+        return ""
 
 
 _State = tuple[tuple[int, int], tuple[int, int]]
@@ -261,8 +260,9 @@ class Journal:
         return self._reserve()
 
     def _check_own(self) -> None:
-        if not self._is_broken and not self._own.check(in_memory=True):
+        if not self._is_broken and self._own.check():
             self._synced, self._is_broken = False, True
+            log.warning("%s: it is written again", self._own.found)
 
     def _reserve(self) -> str | None:
         if self._spare >= 0:

@@ -86,12 +86,14 @@ class Status:
 
         to  the cell that it was sent to, or the target that it chases
         at  its cell, in all coordinates that the terrain has; None outside the terrain
+
+        Raises BusError where the terrain is not known.
         """
         latest, frame = self.latest, self.frame
         driven = latest.driven(latest.plan.crew_now(latest.plan.targets_now(latest.book)), self.now_ns)
         classes, sent = latest.classes(), {goal.name: goal.cell for goal in latest.goals()}
         if frame is None:
-            return []
+            raise BusError("no process of the run has said where its terrain lies: ask again")
 
         def row(id: str, x_m: float, y_m: float, **more: Any) -> dict[str, Any]:
             cell = frame.grid.cell_at(x_m, y_m)

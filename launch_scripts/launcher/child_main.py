@@ -19,7 +19,7 @@ from typing import Any, NamedTuple
 from launch_scripts.launcher.log_file import LogFormat, Speaker, log_to
 from launch_scripts.parent_death import end_with_parent
 from launch_scripts.process_table import TABLE
-from swarm.errors import SwarmError
+from swarm.errors import ArgumentError, SwarmError
 from swarm.files import discard_output
 from swarm.runtime.loop_health import Board, Health
 from swarm.runtime.role_setup import RoleSetup
@@ -70,12 +70,13 @@ def run_child(
     reason = ExitReason("ended as asked", 0)
     try:
         resolve_name(entry)(setup, lambda: _give_way(TABLE[setup.role].niceness))
-    except SwarmError as error:
-        reason = ExitReason(str(error), error.exit_code, refused=True)
-        log.error("%s", error)
     except BaseException as error:
-        reason = ExitReason(f"{type(error).__name__}: {error}", CRASHED)
-        log.critical("crashed", exc_info=True)
+        if isinstance(error, SwarmError) and not isinstance(error, ArgumentError):
+            reason = ExitReason(str(error), error.exit_code, refused=True)
+            log.error("%s", error)
+        else:  # no user calls what raises an ArgumentError here
+            reason = ExitReason(f"{type(error).__name__}: {error}", CRASHED)
+            log.critical("crashed", exc_info=True)
     # Before the last line of the log, which a disk that stalls may hold up.
     with contextlib.suppress(OSError):  # the launcher is gone
         pipe.send(reason)

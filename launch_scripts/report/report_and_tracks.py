@@ -32,7 +32,7 @@ from shared_map.terrain.terrain import Level, Terrain
 from shared_map.terrain.terrain_report import bounds_deg
 from swarm.clock import NS_PER_S
 from swarm.config.input_files import FileKind, read_bytes
-from swarm.errors import OutsideGridError, StoreError
+from swarm.errors import StoreError
 from swarm.files import write_file
 from swarm.grid import GridSpec, walk
 from swarm.wire.messages.map_data import STAMP_LIMIT_NS, MarkKind
@@ -404,7 +404,7 @@ def _routes(columns: Mapping[str, NDArray[Any]], grid: GridSpec) -> list[GivenRo
     for (vehicle, target, time_ns, start, cost_s, bound_s), way, own in zip(rows, ways, legs, strict=False):
         try:
             cells = np.array(walk(grid, start, way.tobytes()), np.int64)
-        except (ValueError, OutsideGridError):
+        except ValueError:
             continue
         turns = np.cumsum([0, *own.tolist()])
         if turns[-1] == len(way):  # a pulled route: straight from turn to turn

@@ -169,15 +169,19 @@ class SealedDatabase:
 
     def check(self) -> None:
         """Looks whether the file is as it was left. SQLite holds a deleted one open: a copy gets its name."""
-        if self._lock is None or self._own.check(in_memory=False):
+        how = "" if self._lock is None else self._own.check()
+        if not how:
             return
+        if how == "changed":  # a restart reads it whole
+            raise DamagedError(self._own.found)
         try:
             with self._new_file() as part, closing(sqlite3.connect(part)) as copy:
                 self._db.backup(copy)
         except sqlite3.Error as error:
             raise StoreError(f"cannot write the store {self.path}: {error}") from error
-        self._db.close()
-        self._db = self._opened()
+        with closing(self._db):
+            self._db = self._opened()
+        log.warning("%s: it is written again", self._own.found)
 
     @contextmanager
     def _new_file(self) -> Iterator[Path]:

@@ -215,7 +215,8 @@ class KeeperService(MemberService):
         self._seen.update(new)
         with suppress(StoreError):
             self._store.check()
-            self._store.save_sightings(new.values())
+            if new:
+                self._store.save_sightings(new.values())
 
     def _name_throttled(self, now_ns: int) -> None:
         """Notes each author that begins to exceed its quota."""

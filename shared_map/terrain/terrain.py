@@ -84,9 +84,8 @@ def build_terrain(scenario: Scenario, progress: Progress = no_progress, vehicle_
 
     if not isinstance(scenario, Scenario):
         raise ArgumentError(f"scenario is of type {type(scenario).__name__}, expected Scenario")
-    if isinstance(
-        getattr(scenario.terrain, "source", ""), str | PathLike
-    ):  # of an array the reader says what to do
+    source_given = getattr(scenario.terrain, "source", "")
+    if isinstance(source_given, str | PathLike):  # of an array the reader says what to do
         scenario = converted(scenario, Scenario, "the scenario")  # which may have been made in Python
     try:
         source = load_source(scenario.terrain, scenario.seed, progress)

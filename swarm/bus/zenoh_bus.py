@@ -199,7 +199,10 @@ def _close_all() -> None:
     """Closes each bus at the exit of the interpreter: after what other modules registered, such as the close of a
     client, by which vehicles leave."""
     for bus in reversed([*_OPEN]):
-        bus.close()
+        try:
+            bus.close()
+        except Exception:
+            log.exception("a bus is not closed")
 
 
 class ZenohBus:

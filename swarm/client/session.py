@@ -197,12 +197,12 @@ class Session:
             try:
                 reply: RouteReply = done.result()[0]
                 found.set_result(Route.of(self.frame, reply.routes[0], reply))
+            except (ValueError, IndexError) as error:
+                found.set_exception(BusError(f"the planner of {target!r} answers nonsense: {error}"))
             except SwarmError as error:
                 known = [name.removeprefix("planner-") for name in self.run.crew if name.startswith("planner-")]
                 there = "" if target in known else choice(target, known, " the scenario has ")
                 found.set_exception(BusError(f"no route to {target!r}: {error}{there}"))
-            except (ValueError, IndexError) as error:
-                found.set_exception(BusError(f"the planner of {target!r} answers nonsense: {error}"))
 
         topic, asker = (NAMELESS_ROUTE, {}) if vehicle is None else (ROUTE, {"asker": asker_of("rover", vehicle)})
         self.ask(topic, request, timeout_s, target=target, **asker).add_done_callback(finish)

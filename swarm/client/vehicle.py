@@ -237,7 +237,7 @@ class Vehicle(Reported):
         way, cell, word = self._has_way(), self.cell, self._word
         here = cell if word is None else way.counted(cell, word.x_m, word.y_m)
         wanted = [checked_cell(self._session.frame, cell) for cell in listed("cells", cells)]
-        path = [here, *(wanted[1:] if wanted[:1] == [here] else wanted)]
+        path = [here, *(wanted[1:] if wanted[:1] in ([here], [cell]) else wanted)]
         try:
             way.want(path)
         except ValueError as error:

@@ -66,6 +66,7 @@ class ExternalService:
     _tag: str = ""
     _asking: bool = False
     _ask_due_ns: int = 0
+    _check_due_ns: int = 0
     _tokens: set[Peer] = field(default_factory=set)
     _began_ns: int = 0
     _cell: int | None = None
@@ -135,7 +136,10 @@ class ExternalService:
                 pass
 
     def tick(self, now_ns: int) -> None:
-        self.generations.check()
+        if now_ns >= self._check_due_ns:
+            self._check_due_ns = now_ns + NS_PER_S
+            if (why := self.generations.check()) is not None:
+                self._warn_once(why)
         external = self.external
         if not (self._asking or (external is not None and external.settled)) and now_ns >= self._ask_due_ns:
             self._ask(now_ns)

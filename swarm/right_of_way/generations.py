@@ -67,8 +67,9 @@ class MemoryGenerations:
     def save(self, generations: Sequence[int]) -> None:
         self.generations = list(generations)
 
-    def check(self) -> None:
-        """Looks whether the file is as it was left."""
+    def check(self) -> str | None:
+        """Looks whether the file is as it was left, and writes it again. Returns the reason if that fails."""
+        return None
 
     def close(self) -> None:
         """Gives it to another process."""
@@ -100,8 +101,8 @@ class GenerationFile(MemoryGenerations):
         self._journal.append(_encoded(generations))
         self._journal.sync()
 
-    def check(self) -> None:
-        self._journal.reserve()
+    def check(self) -> str | None:
+        return self._journal.reserve()
 
     def close(self) -> None:
         self._journal.close()

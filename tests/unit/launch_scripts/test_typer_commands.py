@@ -149,6 +149,7 @@ def test_values_are_completed_with_what_is_there(newest_run: Path, monkeypatch: 
     assert offered("down", "20260101") == ["20260101-000000-aaaa"], "from any folder"
     monkeypatch.chdir(newest_run)
     assert offered("runs", "export", "L") == ["LAST"]
+    assert offered("up", "--seed", "1", "--seed", "2", "ja") == ["jacksboro"], "a refusal would stand in the prompt"
 
 
 def test_nothing_is_offered_where_nothing_can_be_read(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

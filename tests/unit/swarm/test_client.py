@@ -2,6 +2,7 @@
 
 import math
 import threading
+from collections.abc import Sequence
 from itertools import pairwise
 from typing import Any
 
@@ -158,6 +159,33 @@ class NeverAsked:
 
     def counted(self, cell: int, x_m: float, y_m: float) -> int:
         return cell
+
+
+class OnAStep(NeverAsked):
+    """Right of way of a vehicle in a cell beside the diagonal step from (5, 5) to (6, 6)."""
+
+    wanted: Sequence[int] = ()
+    cells = GRID.cell(5, 5), GRID.cell(6, 6)
+
+    def counted(self, cell: int, x_m: float, y_m: float) -> int:
+        return self.cells[0]
+
+    def want(self, path: Sequence[int]) -> None:  # type: ignore[override]
+        self.wanted = path
+
+    def may_enter(self, cell: int, timeout_s: float) -> bool:  # type: ignore[override]
+        return True
+
+
+def test_who_clips_a_cell_beside_a_diagonal_step_keeps_the_cell_that_it_drives_into(world: Swarm) -> None:
+    program, way = Program(world).swarm, OnAStep()
+    rover, beside = program.vehicle("rover"), GRID.cell(5, 6)
+    rover.give_way(way)  # type: ignore[arg-type]
+    rover.at(*program.frame.centre_m(beside))
+    ahead = [GRID.cell(6, 6), GRID.cell(6, 7)]
+    for asked in ([beside, *ahead], [way.cells[0], *ahead], ahead):  # a route begins at `rover.cell`
+        assert rover.reserve(asked) == [way.cells[1]]
+        assert way.wanted == [way.cells[0], *ahead]
 
 
 @pytest.mark.parametrize("wrong", [TRUTH, np.bool_(False), TEXT, b"7", None, [1.0, 2.0], math.nan])
