@@ -101,7 +101,7 @@ class OwnFiles:
                 self._left[path] = now
 
     def check(self) -> Literal["", "deleted", "changed"]:
-        """What became of a file since it was left; a changed one may have the same content. Raises DamagedError
+        """The fate of a file since it was left; a changed one may have the same content. Raises DamagedError
         where its name belongs to another file, perhaps of a process."""
         for path, left in self._left.items():
             if (now := _state(path)) == left:

@@ -50,7 +50,9 @@ def ask(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Any:
             return Future()
 
         number = partial(Session.number, SimpleNamespace())
-        session: Any = SimpleNamespace(run=info, frame=Frame.of(info), ask=ask, answers=answers, number=number)
+        session: Any = SimpleNamespace(
+            run=info, frame=Frame.of(info), ask=ask, answers=answers, number=number, check_ids=lambda **_: None
+        )
         route = client.Swarm(session).route((5.0, -5.0), (15.0, -5.0))
         return route.cells[-1], len(asked)
 
@@ -65,8 +67,9 @@ def ask(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Any:
         monkeypatch.setattr(swarm_route, "ask_run", lambda _: [info])
         monkeypatch.setattr(swarm_route, "frame_of_run", lambda *_: Frame.of(info))
         bus: Any = None
+        where: Any = SimpleNamespace(plans_no_places="no process plans routes to places here")
         start, end = read_place("cell:0,0", "from"), read_place("cell:0,1", "to")
-        answer = swarm_route.ask_place(bus, "here", start, end, "ground")
+        answer = swarm_route.ask_place(bus, where, start, end, "ground")
         return answer.path()[-1], len(asked)
 
     return by_client if request.param == "client" else by_command

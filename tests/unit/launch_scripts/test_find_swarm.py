@@ -31,9 +31,11 @@ def listens() -> Iterator[list[int]]:
 def _nobody_at_the_usual_endpoint(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
     monkeypatch.setenv("SWARM_STATE", str(tmp_path / "state"))
     (port,) = free_ports(1)
-    connect = ("connect", tuple[str, ...], (f"tcp/127.0.0.1:{port}",))
-    usual = msgspec.defstruct("Usual", [connect], bases=(NetworkConfig,), frozen=True, kw_only=True)
-    monkeypatch.setattr("swarm.config.scenario.NetworkConfig", usual)
+
+    class Usual(NetworkConfig, frozen=True, kw_only=True):
+        connect: tuple[str, ...] = (f"tcp/127.0.0.1:{port}",)
+
+    monkeypatch.setattr("swarm.config.scenario.NetworkConfig", Usual)
 
 
 def make_run(runs: Path, name: str, port: int, *, namespace: str = "swarm", over: bool = False) -> None:
