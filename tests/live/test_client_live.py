@@ -296,7 +296,8 @@ def vehicles_of(live: LiveSwarm, agent: str, count: int) -> set[str]:
 
 
 def add(live: LiveSwarm, *options: object) -> subprocess.Popen[str]:
-    words = [*SWARM, "order", "vehicle", "add", live.path, "--runs", live.runs, "--group", "all", *options]
+    words = [*SWARM, "order", "vehicle", "add", live.path, "--runs", live.runs, *options]
+    words += [] if "--group" in options else ["--group", "all"]
     return subprocess.Popen(list(map(str, words)), stderr=subprocess.PIPE, text=True)
 
 

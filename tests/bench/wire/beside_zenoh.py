@@ -26,6 +26,7 @@ from shared_map.cost_map import CostMap
 from shared_map.replication.replica import MapReplica
 from shared_map.replication.replica_sync import MapSync
 from shared_map.terrain.terrain import terrain_of_pace
+from swarm.bus.bus import meant_for
 from swarm.bus.zenoh_bus import ZenohBus, open_bus
 from swarm.clock import NS_PER_S
 from swarm.config.scenario import MapConfig
@@ -159,8 +160,9 @@ def throughput(far: Far, sets: int, rounds: int) -> dict[str, float]:
         _settle(bus, peer)
         for nth in range(rounds):
             numbers = range(nth * sets, (nth + 1) * sets)
-            payloads = [encode(some_set(n % tiles, n // tiles, 8, "writer.1")) for n in numbers]
             keys = [map_key(n % tiles, "writer.1") for n in numbers]
+            sets_of = [encode(some_set(n % tiles, n // tiles, 8, "writer.1")) for n in numbers]
+            payloads = [meant_for(key, each) for key, each in zip(keys, sets_of, strict=True)]
             for name, root in (("raw", RAW), ("ours", NAMESPACE)):
                 whole = [f"{root}/{key}" for key in keys]
                 maker = CODES if name == "ours" else None
