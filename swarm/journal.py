@@ -29,7 +29,7 @@ from collections.abc import Callable, Iterable
 from contextlib import suppress
 from hashlib import blake2b
 from pathlib import Path
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 from swarm.config.input_files import FileKind, read_bytes
 from swarm.errors import DamagedError, StoreError, SwarmError
@@ -100,17 +100,16 @@ class OwnFiles:
             if now is not None and (new or now[0] == self._left.get(path, now)[0]):
                 self._left[path] = now
 
-    def check(self) -> Literal["", "deleted", "changed"]:
-        """The fate of a file since it was left; a changed one may have the same content. Raises DamagedError
-        where its name belongs to another file, perhaps of a process."""
+    def check(self) -> str:
+        """The fate of a file since it was left: "", "deleted" or "changed"; its content may be the same. Raises
+        DamagedError where its name belongs to another file, perhaps of a process."""
         for path, left in self._left.items():
             if (now := _state(path)) == left:
                 continue
-            self.found = f"{self._what}{path} was %s by another program while it was in use"
-            if now is not None and now[0] != left[0]:
-                raise DamagedError(self.found % "replaced")
-            how: Literal["deleted", "changed"] = "deleted" if now is None else "changed"
-            self.found %= how
+            how = "deleted" if now is None else "changed" if now[0] == left[0] else "replaced"
+            self.found = f"{self._what}{path} was {how} by another program while it was in use"
+            if how == "replaced":
+                raise DamagedError(self.found)
             return how
         return ""
 

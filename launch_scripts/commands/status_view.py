@@ -69,7 +69,7 @@ class Status:
     def silent(self) -> list[str]:
         """Processes that the run needs, or that are alive, and have not answered. Outside vehicles never do."""
         latest = self.latest
-        expected = dict.fromkeys((*latest.plan.crew_now(latest.plan.targets_now(latest.book)), *latest.up()))
+        expected = dict.fromkeys((*latest.needed(), *latest.up()))
         answered = {(info.role, info.id) for info in (*self.members, *self.strangers)}
         return [
             f"{role}-{id}"
@@ -90,7 +90,7 @@ class Status:
         Raises BusError where the terrain is not known.
         """
         latest, frame = self.latest, self.frame
-        driven = latest.driven(latest.plan.crew_now(latest.plan.targets_now(latest.book)), self.now_ns)
+        driven = latest.driven(latest.needed(), self.now_ns)
         classes, sent = latest.classes(), {goal.name: goal.cell for goal in latest.goals()}
         if frame is None:
             raise BusError("no process of the run has said where its terrain lies: ask again")

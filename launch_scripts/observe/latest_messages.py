@@ -358,10 +358,13 @@ class LatestState(Counts):
         """Rank of the process that leads."""
         return self._ranks.get((role, job), 0)
 
+    def needed(self) -> list[tuple[str, str]]:
+        """(role, id) of the processes that the run needs now."""
+        return self.plan.crew_now(self.plan.targets_now(self.book))
+
     def missing(self) -> list[str]:
         """Processes that the run needs which are not alive, as `role id`."""
-        crew = self.plan.crew_now(self.plan.targets_now(self.book))
-        return [f"{role} {id}" for role, id in crew if not self.fills(role, id)]
+        return [f"{role} {id}" for role, id in self.needed() if not self.fills(role, id)]
 
     # --- trackers -------------------------------------------------------------------------------------------------
 

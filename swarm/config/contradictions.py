@@ -1,4 +1,4 @@
-"""Contradictions between settings which are valid one by one, and the rule of endpoints.
+"""Contradictions between settings which are valid one by one.
 
 Each is a sentence with the keys that it rests on, so that it is left out where one of these could not be read.
 """

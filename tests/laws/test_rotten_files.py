@@ -275,7 +275,7 @@ def test_a_file_harmed_in_use_is_written_again_or_ends_its_process(
     tmp_path: Path, name: str, harm: str, idle: bool
 ) -> None:
     name, tail = ("marks", "-wal") if name == "log of marks" else (name, "")
-    whole, tried = (Running(name, tmp_path / each / "store") for each in ("whole", "tried"))
+    whole, tried = (Running(name, tmp_path / f"{each} 5%s %" / "store") for each in ("whole", "tried"))
     for each in (whole, tried):
         for _ in range(3):
             each.commit()
