@@ -126,24 +126,33 @@ def _state(path: Path) -> _State | None:
 
 
 class Lock:
-    """The locked file beside a store, which holds its witness. The lock ends with its process.
+    """The locked file beside a store, which holds its witness. It is made again if it is deleted.
+
+    The lock ends with its process.
 
     waits   for the end of a process that has locked it
     in_use  why it is refused otherwise
     """
 
     def __init__(self, path: Path, in_use: str, *, waits: bool = False) -> None:
-        self._path = path
-        make_folder(path.parent)
-        with writing(path):
-            self._file = os.open(f"{path}.lock", os.O_CREAT | os.O_RDWR, 0o600)
+        self._path, self._in_use = path, in_use
+        self._file = self._locked(waits=waits)
+
+    def _locked(self, *, waits: bool) -> int:
+        make_folder(self._path.parent)
+        with writing(self._path):
+            file = os.open(f"{self._path}.lock", os.O_CREAT | os.O_RDWR, 0o600)
         try:
-            _lock(path, self._file, in_use, waits=waits)
+            _lock(self._path, file, self._in_use, waits=waits)
         except StoreError:
-            self.close()
+            os.close(file)
             raise
+        return file
 
     def witness(self, seal: Seal) -> None:
+        if not Path(f"{self._path}.lock").exists():
+            file, self._file = self._file, self._locked(waits=False)
+            os.close(file)
         with writing(self._path):
             os.pwrite(self._file, seal.packed(), 0)
 

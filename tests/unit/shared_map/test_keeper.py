@@ -87,6 +87,15 @@ def test_of_two_keepers_on_one_store_whose_lock_was_deleted_one_ends_and_no_set_
         assert list(store.load()) == [sets[0], *sets[2:]]
 
 
+def test_a_lock_that_is_deleted_is_made_again_at_the_next_commit(tmp_path: Path) -> None:
+    path = tmp_path / "map.sqlite"
+    with KeeperStore(path) as store:
+        (tmp_path / "map.sqlite.lock").unlink()
+        store.save(some_sets())
+        with pytest.raises(StoreError, match="is in use by another keeper"):
+            KeeperStore(path)
+
+
 def test_the_store_of_another_terrain_is_refused(tmp_path: Path) -> None:
     store = KeeperStore(tmp_path / "map.sqlite")
     store.bind("0123456789abcdef", GRID)

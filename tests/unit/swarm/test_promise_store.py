@@ -20,6 +20,7 @@ from launch_scripts.simulation.simulate import Simulation
 from swarm.config.revocations import revoke
 from swarm.config.scenario import NetworkConfig, TlsConfig
 from swarm.errors import DamagedError, StoreError
+from swarm.journal import SEAL_BYTES
 from swarm.right_of_way import promise_store
 from swarm.right_of_way.agent_core import OwnRecord, RightOfWay
 from swarm.right_of_way.promise_store import FilePromiseStore, PromiseStore
@@ -68,6 +69,7 @@ def test_promises_go_on_and_stay_locked_whatever_is_moved_or_deleted(tmp_path: P
         elif seq == at and gone != "nothing":
             (path.parent / gone).unlink()
     store.sync()
+    assert (path.parent / "promises-a0.lock").read_bytes() == path.read_bytes()[:SEAL_BYTES]
     with pytest.raises(StoreError, match="is in use by the same agent"):
         FilePromiseStore(path)
     store.close()
