@@ -197,7 +197,7 @@ def give(where: Where, as_json: bool, *orders: dict[str, Any], at: str | None = 
     printed: list[dict[str, Any]] = []
     with where.operators_bus() as (bus, found):
         sent = any(isinstance(order, SendVehicle) and not order.off for order in made)
-        if sent and not any(name.startswith("places-") for info in found for name in info.crew):
+        if sent and not any(info.plans_to_places for info in found):
             raise ConfigError(where.plans_no_places)
         for order in made:
             said: dict[str, Any] = {}

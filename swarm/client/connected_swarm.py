@@ -295,7 +295,6 @@ class Swarm:
         Raises ConfigError on a place outside the terrain, BusError where no process plans to places.
         """
         until_s = time.monotonic() + self._session.number("timeout_s", timeout_s, 0, 1e9)
-        served = any(name.startswith("places-") for name in self._session.run.crew)
         start, goal = self.frame.cell(*point("start_m", start_m)), self.frame.cell(*point("goal_m", goal_m))
         self._session.check_ids(vehicle_class=vehicle_class)
         request = PlaceRouteRequest(to=goal, cells=[start], vehicle_class=str(vehicle_class))
@@ -307,7 +306,7 @@ class Swarm:
                 if reply.status != "growing" or time.monotonic() >= until_s:
                     return Route.of(self.frame, reply.routes[0], reply)
             except NoAnswerError:
-                if not served or time.monotonic() >= until_s:
+                if not self._session.run.plans_to_places or time.monotonic() >= until_s:
                     raise
                 time.sleep(AGAIN_S)
             except (ValueError, IndexError) as error:

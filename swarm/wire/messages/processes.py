@@ -47,6 +47,11 @@ class RunInfo(Message, frozen=True, kw_only=True, tag=schema_of("run")):
     wire_version: fields.Count = 8
     shard_cells: fields.Count = REGION_CELLS
 
+    @property
+    def plans_to_places(self) -> bool:
+        """True if a process of the run plans routes between any two places."""
+        return any(name.startswith("places-") for name in self.crew)
+
 
 class Alarm(msgspec.Struct, frozen=True, kw_only=True):
     """A process's notice to people that watch the run: a collision, an author beyond its quota.
