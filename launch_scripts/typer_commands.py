@@ -19,6 +19,7 @@ import pkgutil
 import re
 import signal
 import sys
+import tomllib
 from collections.abc import Callable, Iterator
 from copy import copy
 from dataclasses import fields, is_dataclass
@@ -246,17 +247,6 @@ def _files_of(incomplete: str) -> Iterator[str]:
 _NO_PATHS = (errno.ENAMETOOLONG, errno.ELOOP, errno.EACCES, errno.EPERM, errno.ENOTDIR)
 """Errors about a path that cannot be one, or not for this user."""
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
-_SYNONYMS = {
-    "start": ("up", "start"), "run": ("up",), "stop": ("down", "stop"), "quit": ("down",), "log": ("logs",),
-    "list": ("ls", "ps"), "ls": ("ps",), "init": ("new",), "create": ("new", "add"), "version": ("--version",),
-    "delete": ("remove",), "rm": ("remove",), "plan": ("deploy plan",), "terrain route": ("swarm route --terrain",),
-    "dem": ("terrain info",), "watch": ("top",), "validate": ("check",), "sweep": ("study run",),
-    "go": ("start",), "gone": ("forget",), "map": ("marks",), "synth": ("generate",), "plugins": ("check",),
-    **{name: (f"role {name}",) for name in ("router", "keeper", "planner", "places", "agent", "monitor")},
-    "bench": ("./launch_scripts/bench of a checkout",), "chaos": ("./launch_scripts/bench chaos of a checkout",),
-}  # fmt: skip
-"""Word that other programs have, or we had, perhaps after its group -> our words, the first of which that a group
-knows is meant."""
 
 
 def run_command(command: Callable[[], Any], name: str = "swarm") -> int:
@@ -347,7 +337,8 @@ def _meant(word: str, ctx: Any) -> str:
     or all that are known here."""
     known, singular = ctx.command.commands, word.removesuffix("s")
     file = (f"up {word}", f"info {word}") if "." in word else ()
-    words = _SYNONYMS.get(f"{ctx.info_name} {word}", _SYNONYMS.get(word, file))
+    synonyms = tomllib.loads(Path(__file__).with_name("synonyms.toml").read_text(encoding="utf-8"))
+    words = synonyms.get(f"{ctx.info_name} {word}", synonyms.get(word, file))
     meant = [each for each in words if each.split()[0] in {"swarm", *known} or each[0] in "-."][:1]
     if not meant and singular not in known:
         meant = _elsewhere(singular, ctx)

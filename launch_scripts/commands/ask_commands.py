@@ -6,7 +6,7 @@ import json
 import os
 from importlib.resources import files
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
@@ -199,7 +199,7 @@ def metrics(
         return
     from launch_scripts.observe.run_observer import OutsideObserver
     from launch_scripts.web.health_pages import Process
-    from launch_scripts.web.prometheus import MetricsEndpoint, families
+    from launch_scripts.web.prometheus import Families, MetricsEndpoint, families
     from swarm.clock import MonotonicClock
     from swarm.runtime.loop_health import Health, supervisor_of
     from swarm.wire.topics import STATS, STATUS
@@ -211,9 +211,9 @@ def metrics(
         with where.bus() as bus:
             clock, observer = MonotonicClock(), OutsideObserver(bus, topics={STATS: 0.0, STATUS: 0.0}, follows=True)
 
-            def figures() -> list[Any]:
+            def figures() -> Families:
                 run, latest = observer.run, observer.latest
-                return families(run, latest, latest.status, latest.up()) if run and latest else []
+                return families(run, latest, latest.status, latest.up()) if run and latest else Families()
 
             typer.echo(f"metrics at {endpoint.url}; Ctrl-C ends it")
             told = None

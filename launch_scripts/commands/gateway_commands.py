@@ -5,7 +5,7 @@ from __future__ import annotations
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
+from typing import Annotated, ClassVar, Literal
 
 import typer
 
@@ -14,14 +14,11 @@ from launch_scripts.observe.run_folders import RUNS
 from launch_scripts.process_table import check_name
 from launch_scripts.stop_requests import stop_requests
 from launch_scripts.typer_commands import command, family_app
-from swarm.config.scenario import agent_of
+from swarm.client import Swarm, connect
+from swarm.config.scenario import NetworkConfig, agent_of
 from swarm.endpoints import listening
 from swarm.errors import BusError, ConfigError
 from swarm.places import read_place
-
-if TYPE_CHECKING:
-    from swarm.client import Swarm
-    from swarm.config.scenario import NetworkConfig
 
 app = family_app("Connect a running swarm to ROS 2, and to vehicles that speak MAVLink.")
 _MOST_ALTITUDE_M = 10_000.0
@@ -86,8 +83,6 @@ def ros2(
 
 def _join(network: NetworkConfig) -> Swarm:
     """A connection to a swarm, by its first router."""
-    from swarm.client import connect
-
     tls = network.tls
     files = {} if tls is None else {"ca": tls.ca, "certificate": tls.certificate, "key": tls.key}
     return connect(network.connect[0], namespace=network.namespace, timeout_s=network.connect_timeout_s, **files)

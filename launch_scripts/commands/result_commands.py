@@ -15,16 +15,16 @@ from rich.table import Table
 from rich.text import Text
 
 from launch_scripts.commands.shared_options import AsJson, Force, Runs, duration
-from launch_scripts.launcher.console import REPORTED, progress
+from launch_scripts.launcher.console import progress
 from launch_scripts.observe.run_folders import SCENARIO_FILE, find_run, read_report
 from launch_scripts.plain_text import plain
+from launch_scripts.report.compare import LeftRun, circumstances_that_differ, figures, settings_that_differ, text_of
 from launch_scripts.typer_commands import command, complete_runs, family_app
 from swarm.config.explain import choice
 from swarm.config.input_files import FileKind, parse_toml, read_text
 from swarm.errors import ConfigError
 
 if TYPE_CHECKING:
-    from launch_scripts.report.compare import LeftRun
     from launch_scripts.simulation.replay import Replayed
 
 app = family_app("Compare, export and replay finished runs, and write their reports again.")
@@ -53,13 +53,11 @@ def compare(
 
     run  Folders of runs, or their names in --runs.
     """
-    from launch_scripts.report.compare import circumstances_that_differ, figures, settings_that_differ, text_of
-
     if len(run) < 2:
         raise ConfigError("compare takes two runs or more, such as two folders in runs/")
     found = [_left(name, runs) for name in run]
     settings, made = settings_that_differ(found), circumstances_that_differ(found)
-    numbers = figures(found, REPORTED)
+    numbers = figures(found)
     if as_json:
         told = {"scenario": dict(settings), "made": dict(made), "figures": dict(numbers)}
         typer.echo(json.dumps({"runs": [each.name for each in found], **told}, indent=2, default=str))
@@ -81,8 +79,6 @@ def compare(
 
 
 def _left(name: str, runs: Path) -> LeftRun:
-    from launch_scripts.report.compare import LeftRun
-
     folder = find_run(name, runs)
     report, path = read_report(folder), folder / SCENARIO_FILE
     settings = None

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import tomllib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
@@ -98,41 +99,29 @@ def _check(path: Path, text: str) -> None:
 
 
 def _settings(path: Path, chosen: Choices) -> dict[str, Any]:
-    """Returns the settings to write: enough to show the form of a scenario, and no more."""
+    """Returns the settings to write; those which are None are left out."""
+    from swarm.config.scenario_files import with_settings
     from swarm.config.setting_types import MOST_PER_AGENT
 
-    terrain: dict[str, Any] = {"source": _from(path, chosen.terrain)}
-    if chosen.photo:
-        terrain["photo"] = _from(path, chosen.photo)
-    if chosen.terrain == "synthetic":
-        terrain |= {"rows": 256, "cols": 256, "relief_m": 400.0, "roads": 4}
-    terrain["hidden"] = {"closed_roads": 1, "rubble_fields": 10}
-    cost: dict[str, Any] = {"preset": chosen.preset} if chosen.preset else {"flat_speed_m_per_s": 10.0}
     name = "".join(letter if letter.isalnum() and letter.isascii() else "-" for letter in path.stem).strip("-")
-    return {
+    settings: dict[str, Any] = {
         "name": name[:40] or "unnamed",
-        "seed": 1,
         "seconds": chosen.seconds,
-        "time_scale": 1.0,
-        "terrain": terrain,
-        "cost": cost if chosen.preset else {**cost, "max_slope_deg": 35.0},
-        "planner": {"places": True},
-        "targets": [
-            {
-                "name": "t" if chosen.targets > 1 else "t0",
-                "count": chosen.targets,
-                "walk": chosen.walk,
-                "speed_m_per_s": 4.0,
-            }
-        ],
-        "groups": [{"name": "all", "vehicles": chosen.vehicles, "start": "spread"}],
-        "vehicles": {
-            "per_agent": min(max(_LEAST_PER_AGENT, -(-chosen.vehicles // _AGENTS)), MOST_PER_AGENT),
-            "tick_hz": 10.0,
-            "sense_range_m": 300.0,
-            "capture_range_m": 150.0,
-        },
+        "terrain.source": _from(path, chosen.terrain),
+        "terrain.photo": _from(path, chosen.photo) if chosen.photo else None,
+        "cost.preset": chosen.preset,
+        "targets.0.name": "t" if chosen.targets > 1 else "t0",
+        "targets.0.count": chosen.targets,
+        "targets.0.walk": chosen.walk,
+        "groups.0.vehicles": chosen.vehicles,
+        "vehicles.per_agent": min(max(_LEAST_PER_AGENT, -(-chosen.vehicles // _AGENTS)), MOST_PER_AGENT),
     }
+    if chosen.terrain != "synthetic":
+        settings |= dict.fromkeys(("terrain.rows", "terrain.cols", "terrain.relief_m", "terrain.roads"))
+    if chosen.preset:
+        settings |= dict.fromkeys(("cost.flat_speed_m_per_s", "cost.max_slope_deg"))
+    usual = tomllib.loads(Path(__file__).with_name("new_scenario.toml").read_text(encoding="utf-8"))
+    return with_settings(usual, settings, str(path))
 
 
 def _from(path: Path, name: str) -> str:

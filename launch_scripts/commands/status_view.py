@@ -6,7 +6,7 @@ import json
 import time
 from contextlib import nullcontext, suppress
 from dataclasses import asdict, dataclass, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import msgspec
 from rich.console import Console, Group
@@ -14,6 +14,7 @@ from rich.live import Live
 from rich.table import Table
 from rich.text import Text
 
+from launch_scripts.commands.shared_options import Where
 from launch_scripts.launcher import console as terminal
 from launch_scripts.launcher.console import Tell, progress
 from launch_scripts.observe import run_state as facts
@@ -26,6 +27,7 @@ from launch_scripts.plain_text import plain, unanswered
 from launch_scripts.process_table import ROLES
 from launch_scripts.stop_requests import stop_requests
 from shared_map.terrain.map_frame import MapFrame
+from swarm.bus.bus import Bus
 from swarm.clock import NS_PER_S, MonotonicClock
 from swarm.errors import BusError
 from swarm.places import extent_of, fields_of, written
@@ -33,10 +35,6 @@ from swarm.wire.messages.orders import GoalState
 from swarm.wire.messages.planning import PlannerStatus
 from swarm.wire.messages.processes import RunInfo
 from swarm.wire.messages.vehicles import VehicleState
-
-if TYPE_CHECKING:
-    from launch_scripts.commands.shared_options import Where
-    from swarm.bus.bus import Bus
 
 _SHOWN_ALARMS, _SHOWN_ON_TOP = 12, 3
 """Alarms of `status` and of `top`, whose table has to fit a terminal."""

@@ -8,14 +8,16 @@ import time
 from dataclasses import dataclass
 from fnmatch import fnmatch
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 import typer
 
+from launch_scripts.commands.shared_options import Where
 from launch_scripts.commands.terrain_routes import DescribedRoute, metres_along, write_route
 from launch_scripts.observe.run_observer import ask_run, frame_of_run
 from shared_map.terrain.map_frame import MapFrame
+from swarm.bus.bus import Bus
 from swarm.config.explain import choice
 from swarm.config.vehicle_classes import GROUND
 from swarm.errors import BusError, ConfigError, TerrainError
@@ -28,10 +30,6 @@ from swarm.wire.messages import Message
 from swarm.wire.messages.planning import PlaceRouteReply, PlaceRouteRequest, RouteReply, RouteRequest
 from swarm.wire.route_columns import Route, RouteStatus, TargetStatus
 from swarm.wire.topics import PLACE_ROUTE, ROUTE, Topic, asker_of
-
-if TYPE_CHECKING:
-    from launch_scripts.commands.shared_options import Where
-    from swarm.bus.bus import Bus
 
 M = TypeVar("M", bound=Message)
 

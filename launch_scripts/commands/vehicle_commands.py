@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import time
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import typer
 from msgspec.structs import replace
@@ -13,6 +13,7 @@ from launch_scripts.commands.order_commands import give
 from launch_scripts.commands.role_commands import Part, run_role
 from launch_scripts.commands.shared_options import AsJson, Where
 from launch_scripts.typer_commands import command, family_app
+from swarm.bus.bus import Bus
 from swarm.config.scenario import agent_of
 from swarm.errors import BusError, ConfigError
 from swarm.grid import GridSpec
@@ -22,9 +23,6 @@ from swarm.runtime.operator import replies_to
 from swarm.wire.messages.orders import Then
 from swarm.wire.messages.vehicles import Removed, RemoveVehicles
 from swarm.wire.topics import LEAVE
-
-if TYPE_CHECKING:
-    from swarm.bus.bus import Bus
 
 _WITHIN_S = 5.0
 """Longest wait until cells are free: leaders answer within a lease, which is shorter."""

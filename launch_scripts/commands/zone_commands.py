@@ -7,7 +7,7 @@ import math
 import time
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import msgspec
 import typer
@@ -17,15 +17,13 @@ from launch_scripts.commands.shared_options import AsJson, Where, duration
 from launch_scripts.observe.run_observer import frame_of_run
 from launch_scripts.plain_text import Duration
 from launch_scripts.typer_commands import command, family_app
+from shared_map.terrain.map_frame import MapFrame
 from swarm.config.ground import ZoneConfig
 from swarm.config.input_files import FileKind, check_file
 from swarm.errors import ConfigError, TerrainError
 from swarm.places import corners_of, fields_of, read_place, written
 from swarm.runtime.operator import Acknowledged, Operator, checked
 from swarm.wire.messages.orders import MOST_CORNERS, Zone, ZoneOrder, Zones
-
-if TYPE_CHECKING:
-    from shared_map.terrain.map_frame import MapFrame
 
 app = family_app("""Close areas of the terrain, slow them down, and open them again, while the swarm runs.
 

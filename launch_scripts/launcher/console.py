@@ -48,31 +48,6 @@ _READER_GONE = frozenset((errno.EPIPE, errno.EIO, errno.EBADF, errno.ENXIO))
 
 _FILES = (("report", "report.json"), ("report", "report.html"), ("picture", "report.png"))
 _LEVELS = {"red": logging.ERROR, "yellow": logging.WARNING}
-REPORTED = {
-    "seconds": "run, s",
-    "startup_s": "start-up, s",
-    "processes": "needed processes",
-    "restarts": "restarts",
-    "vehicles_routed": "vehicles that had a route",
-    "captures": "captures",
-    "marks": "marks",
-    "reroute_requests": "re-route requests",
-    "routes_served": "routes served",
-    "stranded": "stranded at the end",
-    "lost": "lost at the end",
-    "collisions": "collisions",
-    "lethal_entries": "lethal cells entered",
-    "driven_into": "obstacles driven into",
-    "hit_by_obstacles": "vehicles hit by obstacles",
-    "certified_gap": "certified gap",
-    "learned": "learned, times the prior pace",
-    "growth_ms": "growing a tree, ms",
-    "route_query_ms": "asking for a route, ms",
-    "mark_to_tree_ms": "from mark to tree, ms",
-    "obstacle_ms": "from an obstacle's report to being avoided, ms",
-    "messages_per_s": "messages/s",
-    "payloads_dropped": "payloads dropped",
-}
 
 
 class Terminal:
@@ -146,8 +121,8 @@ class Terminal:
             return
         table = Table(show_header=False, box=None, pad_edge=False)
         for name, value in numbers.items():
-            if name in REPORTED and _counts(value):
-                table.add_row(REPORTED[name], gap_text(value) if name == "certified_gap" else _plain(value))
+            if name in facts.REPORTED and _counts(value):
+                table.add_row(facts.REPORTED[name], gap_text(value) if name == "certified_gap" else _plain(value))
         self.print(table)
 
     def close(self) -> None:

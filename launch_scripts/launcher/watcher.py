@@ -34,7 +34,6 @@ from swarm.wire.messages.vehicles import Followed
 from swarm.wire.topics import FOLLOWED, NOTE, ORDERS, STATS, STATUS
 
 if TYPE_CHECKING:
-    from launch_scripts.observe.latest_messages import LatestState
     from launch_scripts.web.prometheus import MetricsEndpoint
 
 _OF_PART = {ORDERS: HEARD[ORDERS], FOLLOWED: 0.0, STATUS: 0.0}

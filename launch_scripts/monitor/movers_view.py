@@ -110,33 +110,23 @@ class RouteNow:
         return replace(self, cells=self.cells[first:], places=self.places[first:])
 
 
-class RouteLines:
-    """Routes to one target as lines in which no part of the ground is drawn twice.
+def route_lines(mesh: TerrainMesh, stride: int, routes: Iterable[RouteNow]) -> Strips:
+    """Routes to one target as lines in which no part of the ground is drawn twice: each up to where it meets one
+    that is drawn already, the longest first.
 
     Routes to one target join, as the branches of its tree do: a thousand of them have few cells more than the tree.
+
+    stride  number of cells between two points of a line
     """
-
-    def __init__(self, mesh: TerrainMesh, stride: int) -> None:
-        """stride  number of cells between two points of a line"""
-        self._mesh = mesh
-        self._stride = stride
-        self._drawn = np.zeros(mesh.grid.cells, np.bool_)
-
-    def lines(self, routes: Iterable[RouteNow]) -> Strips:
-        """Each route up to where it meets one that is drawn already, the longest first."""
-        parts, drawn = [np.empty((0, 2), np.float32)], self._drawn
-        longest_first = sorted(routes, key=lambda route: len(route.cells), reverse=True)
-        for route in longest_first:
-            met = np.flatnonzero(drawn[route.cells])
-            end = int(met[0]) if len(met) else len(route.cells) - 1
-            if end > 0:
-                drawn[route.cells[: end + 1]] = True
-                parts.append(route.places[np.append(np.arange(0, end, self._stride), end)])
-        for route in longest_first:
-            drawn[route.cells] = False
-        south_m, east_m = ((np.concatenate(parts) + 0.5) * self._mesh.grid.resolution_m).astype(np.float32).T
-        lengths = [len(part) for part in parts[1:]]
-        return ragged(self._mesh.place(east_m, south_m, 0.2 * self._mesh.scale_m), lengths)
+    parts, drawn = [np.empty((0, 2), np.float32)], np.zeros(mesh.grid.cells, np.bool_)
+    for route in sorted(routes, key=lambda route: len(route.cells), reverse=True):
+        met = np.flatnonzero(drawn[route.cells])
+        end = int(met[0]) if len(met) else len(route.cells) - 1
+        if end > 0:
+            drawn[route.cells[: end + 1]] = True
+            parts.append(route.places[np.append(np.arange(0, end, stride), end)])
+    south_m, east_m = ((np.concatenate(parts) + 0.5) * mesh.grid.resolution_m).astype(np.float32).T
+    return ragged(mesh.place(east_m, south_m, 0.2 * mesh.scale_m), [len(part) for part in parts[1:]])
 
 
 def trails_of(scenario: Scenario, mesh: TerrainMesh, level: Level) -> Trails:
@@ -162,7 +152,6 @@ class VehiclesView:
         self._aloft: list[tuple[NDArray[np.intp], Floats]] = []
         """For each flying class the indices of its vehicles in `_ids`, and `TerrainMesh.aloft_m`."""
         self._routes: dict[str, RouteNow] = {}
-        self._route_lines = RouteLines(self._mesh, level.route_stride)
         self._next_target = 0
         self._trails = trails_of(scenario, self._mesh, level)
         self._frame = 0
@@ -239,7 +228,7 @@ class VehiclesView:
         ahead = [
             route.ahead_of(int(cells[n])) for n, route in begun if route is not None and route.target == target
         ]
-        self._pen.lines(f"world/routes/{target}", self._route_lines.lines(ahead))
+        self._pen.lines(f"world/routes/{target}", route_lines(self._mesh, self._level.route_stride, ahead))
 
 
 def vehicle_details(

@@ -7,20 +7,24 @@ is lost.
 An old tree is no alarm: later changes are repaired in it.
 
 An observer opens an alarm only if it also receives the messages which close it, for as long as the run lasts
-(`EVIDENCE`). Otherwise a launcher that receives only a part of the run would show an alarm for ever.
+(`Kind.opened_by`). Otherwise a launcher that receives only a part of the run would show an alarm for ever.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+import tomllib
+from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass
+from pathlib import Path
+
+import msgspec
 
 from launch_scripts.observe.latest_messages import LatestState
 from launch_scripts.plain_text import Duration, Moment, plain
 from swarm.clock import NS_PER_S
 from swarm.peers import job_of
 from swarm.wire.messages.processes import Alarm as WireAlarm
-from swarm.wire.topics import POSE, STATS, STATUS, Topic
+from swarm.wire.topics import STATS
 
 SILENT_NS = 4 * NS_PER_S
 """Every process publishes its counts once a second: one that has not done so for this time hangs, or is cut off."""
@@ -30,30 +34,23 @@ STARTING_S = 30.0
 """A process that has not been seen yet is no alarm in the first seconds of a run."""
 
 
-SERIOUS: Mapping[str, str] = {
-    "collision": "collision",  # two vehicles were on one cell at one time
-    "lethal-entry": "lethal entry",  # a vehicle entered a cell that is lethal in truth
-    "obstacle-collision": "hit an obstacle",  # a vehicle and an obstacle that reports its place met
-    "down": "down",  # a process that the run needs is gone; its launcher starts it again: see its log if it stays
-    "silent": "silent",  # a process is there and has told nothing for 4 s: it hangs or is cut off
-    "keeper-behind": "keeper behind",  # marks wait to be stored, as on a full disk
-}
-KINDS: Mapping[str, str] = {
-    **SERIOUS,
-    "quota": "quarantined",  # an author writes more marks than its quota; they are delayed
-    "target-lost": "target lost",  # no tracker publishes it; routes lead to its last position; search after 30 s
-    "no-tracker": "no tracker",  # none has published the target since its planner started
-    "target-lethal": "target on lethal ground",  # no route leads to it
-    "goal-blocked": "cannot reach its place",  # it was sent there by an order; it asks again every 3 s
-    "shut-in": "vehicle shut in",  # obstacles leave it no cell to which it can drive
-    "behind": "behind",  # a process skips ticks: the machine is too slow for it
-    "restarted": "restarted",  # a process was started again after it had ended
-}
-"""The word on the wire -> what people call it. Serious is what must not be, or stops a part of the run."""
-OF_MANY: Mapping[str, str] = {"behind": "overloaded machine"}
-"""Cause of an alarm that many processes have."""
-EVIDENCE: Mapping[str, tuple[Topic, ...]] = {"down": (), "target-lost": (STATUS, POSE)}
-"""Kind -> the topics that open and close it, beside liveliness tokens; `STATS` of all others."""
+class Kind(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+    """One row of `alarms.toml`, which explains the fields."""
+
+    label: str
+    serious: bool = False
+    of_many: str = ""
+    opened_by: frozenset[str] = frozenset({STATS.name})
+
+
+KINDS = msgspec.convert(
+    tomllib.loads(Path(__file__).with_suffix(".toml").read_text(encoding="utf-8")), dict[str, Kind]
+)
+
+
+def kind_of(word: str) -> Kind:
+    """The kind of an alarm by its word; one that is not in the table is called by the word."""
+    return KINDS.get(word) or Kind(word)
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,11 +89,11 @@ class Alarm:
 
     @property
     def serious(self) -> bool:
-        return self.kind in SERIOUS
+        return kind_of(self.kind).serious
 
     @property
     def label(self) -> str:
-        return KINDS.get(self.kind, self.kind)
+        return kind_of(self.kind).label
 
     @property
     def lasted_s(self) -> float | None:
@@ -163,7 +160,7 @@ def alarms_of(latest: LatestState, targets: Iterable[str], now_ns: int) -> tuple
             is_old=now_ns - heard_ns > _OLD_NS,
         )
         for told, heard_ns in found
-        if set(EVIDENCE.get(told.kind, (STATS,))) <= set(latest.hears)
+        if kind_of(told.kind).opened_by <= {topic.name for topic in latest.hears}
     ]
     lasting = sorted((a for a in alarms if a.lasts), key=lambda a: (not a.serious, a.since_s or 0.0, a.about))
     over = sorted((a for a in alarms if not a.lasts), key=lambda a: (-(a.over_s or 0.0), a.kind, a.about))

@@ -7,14 +7,16 @@ everywhere.
 from __future__ import annotations
 
 import math
+import tomllib
 from collections import Counter
 from collections.abc import Callable, Collection, Hashable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
 
-from launch_scripts.observe.alarms import OF_MANY, SERIOUS, Alarm, alarms_of, starts
+from launch_scripts.observe.alarms import Alarm, alarms_of, kind_of, starts
 from launch_scripts.observe.latest_messages import LatestState, VehicleColumns
 from launch_scripts.observe.summed_counts import CertifiedGap, certified_gap, gap_text, gaps_to, percent
 from launch_scripts.plain_text import Duration, first_of, number_of, plain
@@ -26,6 +28,10 @@ from swarm.wire.messages.orders import GoalState
 
 NONE = "-"
 """Text for an unknown value."""
+_LABELS = tomllib.loads(Path(__file__).with_name("reported.toml").read_text(encoding="utf-8"))
+REPORTED: dict[str, str] = _LABELS["figures"]
+SUMMED: dict[str, str] = _LABELS["summed"]
+"""Figures of a finished run, and those which are summed over its groups: name in its report -> label."""
 
 
 def count(value: float | None) -> str:
@@ -38,10 +44,8 @@ def seconds(value: float | None) -> str:
     return NONE if value is None else str(Duration(value))
 
 
-def distance(value_m: float | None) -> str:
+def distance(value_m: float) -> str:
     """480 m, 1.2 km"""
-    if value_m is None:
-        return NONE
     return f"{value_m:.0f} m" if value_m < 999.5 else f"{value_m / 1000:.1f} km"
 
 
@@ -67,12 +71,8 @@ def factors(value: Mapping[str, float]) -> str:
     return ", ".join(f"{name} x {factor:.2g}" for name, factor in value.items()) or "nothing"
 
 
-def _mean_gap(value: CertifiedGap | None) -> str:
-    return NONE if value is None else percent(value.mean)
-
-
-def _word(value: str | None) -> str:
-    return NONE if value is None else value
+def _mean_gap(value: CertifiedGap) -> str:
+    return percent(value.mean)
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,7 +80,7 @@ class Fact:
     """Label and text of a field of a `RunState`, or of a `TargetLine`, of which it is a column.
 
     label     what people call it
-    text      its value in words; None where it is not known
+    text      its value in words, where that is known
     always    whether every table of targets has the column; else `swarm status` alone
     is_total  it is the count of its name, summed over all processes
     name      of the field, in the report and for programs
@@ -94,7 +94,8 @@ class Fact:
 
     def shown(self, state: RunState | TargetLine) -> str:
         """The fact in words, as people see it."""
-        return self.text(getattr(state, self.name))
+        value = getattr(state, self.name)
+        return NONE if value is None else self.text(value)
 
     def labelled(self, state: RunState) -> str:
         """The same after its label."""
@@ -135,9 +136,9 @@ class TargetLine:
     growths: Annotated[int | None, Fact("re-plans", count)]
     growth_ms: Annotated[float | None, Fact("tree", duration)]
     routes_served: Annotated[int | None, Fact("served", count, always=False)]
-    strategy: Annotated[str | None, Fact("strategy", _word, always=False)]
+    strategy: Annotated[str | None, Fact("strategy", str, always=False)]
     pose_age_s: Annotated[float | None, Fact("seen", seconds, always=False)]
-    tracker: Annotated[str | None, Fact("tracker", _word, always=False)]
+    tracker: Annotated[str | None, Fact("tracker", str, always=False)]
     lost: bool
     starting: bool
 
@@ -229,7 +230,7 @@ def _facts_of(state: type) -> tuple[Fact, ...]:
     return tuple(replace(fact, name=name) for name, facts in notes for fact in facts)
 
 
-FACTS, TARGET_FACTS = _facts_of(RunState), (Fact("target", _word, name="title"), *_facts_of(TargetLine))
+FACTS, TARGET_FACTS = _facts_of(RunState), (Fact("target", str, name="title"), *_facts_of(TargetLine))
 fact = {fact.name: fact for fact in FACTS}.__getitem__
 """A fact of a run by its name. Raises KeyError on a name that is none."""
 
@@ -393,7 +394,8 @@ def together(alarms: Sequence[Alarm]) -> str:
     """Many alarms of one kind in a line."""
     longest = max(alarms, key=lambda alarm: alarm.lasted_s or 0.0)
     names = list(dict.fromkeys(alarm.about for alarm in alarms))
-    cause = f" ({OF_MANY[longest.kind]})" if longest.kind in OF_MANY and len(names) > _SAID_SINGLY else ""
+    of_many = kind_of(longest.kind).of_many
+    cause = f" ({of_many})" if of_many and len(names) > _SAID_SINGLY else ""
     when = f"the longest {longest.when or 'now'}{cause}"
     return f"{longest.label}: {len(alarms):,} times, {first_of(names)}, {when}"
 
@@ -432,7 +434,7 @@ def verdict(report: Mapping[str, Any], failures: Sequence[str] = ()) -> str:
     serious = [
         alarm["text"] + (f" for {Duration(alarm['over_s'] - alarm['since_s'])}" if alarm["over_s"] else "")
         for alarm in report.get("alarms") or []
-        if alarm["kind"] in SERIOUS and (alarm["over_s"] is None or alarm["kind"] == "silent")
+        if kind_of(alarm["kind"]).serious and (alarm["over_s"] is None or alarm["kind"] == "silent")
     ]
     late = (report.get("ticks_late") or 0) / (report.get("ticks") or math.inf)
     overload = [f"overloaded machine, {late:.0%} of ticks were late"] if late > _LATE_SHARE else []

@@ -6,16 +6,11 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from launch_scripts.observe.run_state import REPORTED, SUMMED
 from launch_scripts.observe.summed_counts import percent, sum_of
 
 _WHERE_ONLY = ("network.listen", "network.connect", "monitor.web_port")
 """Keys that say where a run was met, not what ran: free ports differ each time."""
-_SUMMED = {
-    "distance_m": "driven by all, m",
-    "waiting_s": "waited for routes, s",
-    "standing_s": "stood with a route, s",
-}
-"""Columns of `by_group` that are summed over groups."""
 
 
 @dataclass(frozen=True)
@@ -60,18 +55,15 @@ def _that_differ(runs: Sequence[Mapping[str, Any] | None]) -> list[Row]:
     ]
 
 
-def figures(runs: Sequence[LeftRun], labels: Mapping[str, str]) -> list[Row]:
-    """The figures of all runs.
-
-    labels  name in the report -> what people call it
-    """
+def figures(runs: Sequence[LeftRun]) -> list[Row]:
+    """The figures of all runs, by what people call them."""
     told: list[dict[str, Any]] = []
     for report in (run.report for run in runs):
-        named = _flat({label: report.get(name) for name, label in labels.items()}, "")
+        named = _flat({label: report.get(name) for name, label in REPORTED.items()}, "")
         groups, targets = _table(report.get("by_group")), _table(report.get("by_target"))
         told.append(
             {key.replace(".", ", "): value for key, value in named}
-            | {label: _sum(groups, name) for name, label in _SUMMED.items()}
+            | {label: _sum(groups, name) for name, label in SUMMED.items()}
             | {f"captures of {id}": _table(row).get("captures") for id, row in targets.items()}
         )
     rows = [(key, [each.get(key) for each in told]) for key in dict.fromkeys(key for each in told for key in each)]

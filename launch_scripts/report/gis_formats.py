@@ -421,8 +421,9 @@ _WAYPOINT = 16
 """MAVLink's command to drive to a place."""
 _FRAME = 3
 """MAVLink's frame of degrees with heights above home."""
-_ROVER, _PX4 = 10, 12
-"""MAVLink's numbers of a ground vehicle, and of a firmware; a ground station asks before it uploads to another."""
+_PLAN = Path(__file__).with_name("templates") / "mission.plan"
+"""A plan with one item, whose form all have. It is of a ground vehicle (MAVLink's number 10) and of PX4 (12): a
+ground station asks before it uploads to another."""
 
 
 def write_mission(path: Path, places: Sequence[tuple[float, float]]) -> None:
@@ -436,17 +437,14 @@ def write_mission(path: Path, places: Sequence[tuple[float, float]]) -> None:
         lines = [[number, int(not number), *row, 1] for number, row in enumerate([home, *rows])]
         text = "\n".join(["QGC WPL 110", *("\t".join(map(str, line)) for line in lines)]) + "\n"
     else:
-        items = [
-            {"type": "SimpleItem", "autoContinue": True, "doJumpId": number, "frame": frame, "command": command,
-             "params": params, "Altitude": 0, "AltitudeMode": 1, "AMSLAltAboveTerrain": None}
-            for number, (frame, command, *params) in enumerate(rows, 1)
-        ]  # fmt: skip
-        mission = {
-            "version": 2, "firmwareType": _PX4, "vehicleType": _ROVER, "cruiseSpeed": 5, "hoverSpeed": 5,
-            "globalPlanAltitudeMode": 1, "plannedHomePosition": [*places[0], 0], "items": items,
-        }  # fmt: skip
-        fence = {"version": 2, "circles": [], "polygons": []}
-        rally = {"version": 2, "points": []}
-        plan = {"fileType": "Plan", "version": 1, "groundStation": "QGroundControl"}
-        text = json.dumps(plan | {"mission": mission, "geoFence": fence, "rallyPoints": rally}, indent=1)
+        plan = json.loads(_PLAN.read_text(encoding="utf-8"))
+        (form,) = plan["mission"]["items"]
+        plan["mission"] |= {
+            "plannedHomePosition": [*places[0], 0],
+            "items": [
+                {**form, "doJumpId": number, "frame": frame, "command": command, "params": params}
+                for number, (frame, command, *params) in enumerate(rows, 1)
+            ],
+        }
+        text = json.dumps(plan, indent=1)
     write_file(path, text.encode())

@@ -99,6 +99,8 @@ def mark_layer(grid: GridSpec, kinds: NDArray[np.uint8], paces: NDArray[np.float
     kinds  uint8 (rows, cols): a MarkKind where something is marked, any other number elsewhere
     paces  float32 (rows, cols), s/m, where the kind is PACE
     """
+    import shapely
+
     layer = Layer(
         "marks", "Polygon", {"kind": "text", "pace_s_per_m": "real", "cells": "int", "area_m2": "real"},
         about="A mark is lethal, or the pace in seconds per metre that was measured.",
@@ -110,17 +112,11 @@ def mark_layer(grid: GridSpec, kinds: NDArray[np.uint8], paces: NDArray[np.float
     rounded, of_cell = np.unique(np.round(known / power) * power, return_inverse=True)
     codes[paced] = 2 + of_cell
     for code, rings in gis.areas_of(codes, codes > 0, grid):
-        border_m2, *holes_m2 = map(_enclosed_m2, rings)
-        area_m2 = border_m2 - sum(holes_m2)
+        area_m2 = shapely.Polygon(rings[0], rings[1:]).area
         kind, pace = ("lethal", None) if code == 1 else ("pace", float(f"{rounded[code - 2]:.4g}"))
         told = (kind, pace, round(area_m2 / grid.resolution_m**2), round(area_m2, 3))
         layer.features.append(Feature(rings, dict(zip(layer.fields, told, strict=True))))
     return layer
-
-
-def _enclosed_m2(ring: gis.Points) -> float:
-    x_m, y_m = (ring - ring[0]).T
-    return float(abs(np.dot(x_m[:-1], y_m[1:]) - np.dot(x_m[1:], y_m[:-1])) / 2)
 
 
 WHAT: Mapping[str, Callable[[RunTracks, Groups], list[Layer]]] = {

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shared_map.terrain.terrain import Terrain, build_terrain, terrain_of_pace
-from swarm.config.scenario import RoverConfig, Scenario
+from swarm.config.scenario import Scenario
 from swarm.config.scenario_files import parse_scenario
 
 CROWDS = ("open", "doors", "corridor", "maze")
@@ -34,12 +34,6 @@ ROVERS = "rovers"
 """A crowd with 20 rovers that avoid no vehicle."""
 MIXED = ("small", "wide", *CROWDS)
 WORLDS = (*MIXED, ROVERS, "slopes")
-_ROVERS = (
-    RoverConfig(name="quick", count=8, speed_m_per_s=3.0, radius_m=1.0),
-    RoverConfig(name="slow", count=8, speed_m_per_s=0.8, radius_m=4.0),
-    RoverConfig(name="wide", count=2, speed_m_per_s=1.0, radius_m=12.0),
-    RoverConfig(name="still", count=2, speed_m_per_s=0.0, radius_m=3.0),
-)
 
 
 def crowd(kind: str, seed: int, vehicles: int, per_agent: int, side: int = 40) -> tuple[Scenario, Terrain]:
@@ -81,7 +75,7 @@ def world(name: str, seed: int) -> tuple[Scenario, Terrain]:
     if name == ROVERS:
         kind = CROWDS[seed % len(CROWDS)]
         scenario, terrain = crowd(kind, seed, vehicles=200, per_agent=25)
-        return msgspec.structs.replace(scenario, name=f"rovers-{kind}", rovers=_ROVERS), terrain
+        return msgspec.structs.replace(scenario, name=f"rovers-{kind}", rovers=of_file(ROVERS).rovers), terrain
     if name in CROWDS:
         return crowd(name, seed, vehicles=200, per_agent=25)
     scenario = seeded(seed, of_file(name))

@@ -60,12 +60,16 @@ class Run(NamedTuple):
     started_ns: int
 
 
-class _Families:
-    """Metric families by name. The first to add a name owns it: counters of processes have names from the network,
-    and none of them replaces one of ours."""
+class Families(Collector):
+    """Metric families by name, which encoders collect. The first to add a name owns it: counters of processes have
+    names from the network, and none of them replaces one of ours."""
 
     def __init__(self) -> None:
         self.made: dict[str, tuple[str, Any]] = {}
+
+    def collect(self) -> list[Metric]:
+        """All families, each once, in order of name."""
+        return [family for _, (_, family) in sorted(self.made.items(), key=lambda item: item[0])]
 
     def add(
         self, kind: Any, name: str, labels: Mapping[str, str], *value: object, text: str = "", of: str = ""
@@ -85,22 +89,22 @@ class _Families:
 
 def families(
     run: Run | RunInfo | None, counts: Counts, status: Mapping[str, PlannerStatus], up: Collection[tuple[str, str]]
-) -> list[Metric]:
-    """All metric families of what an observer knows, each once, in order of name.
+) -> Families:
+    """All metric families of what an observer knows.
 
     run  None where it knows a part of the run only
     up   (role, id) of the processes that are alive
     """
-    made = _Families()
+    made = Families()
     if run is not None:
         made.add(InfoMetricFamily, "run", {}, {"run_id": run.run_id, "scenario": run.scenario})
         made.add(Gauge, "run_start_time_seconds", {}, run.started_ns / NS_PER_S)
     _add_targets(made, counts, status)
     _add_processes(made, counts, up)
-    return [family for _, (_, family) in sorted(made.made.items(), key=lambda item: item[0])]
+    return made
 
 
-def _add_targets(made: _Families, counts: Counts, status: Mapping[str, PlannerStatus]) -> None:
+def _add_targets(made: Families, counts: Counts, status: Mapping[str, PlannerStatus]) -> None:
     for target, count in counts.counts_by(CAPTURES_OF).items():
         made.add(Counter, "target_captures", {"target": target}, count)
     for target, gaps in counts.histograms_by(GAPS_TO).items():
@@ -116,7 +120,7 @@ def _add_targets(made: _Families, counts: Counts, status: Mapping[str, PlannerSt
                 made.add(Gauge, f"target_{name}", {"target": target}, value)
 
 
-def _add_processes(made: _Families, counts: Counts, up: Collection[tuple[str, str]]) -> None:
+def _add_processes(made: Families, counts: Counts, up: Collection[tuple[str, str]]) -> None:
     newest = {key: ({"role": key[0], "id": key[1]}, stats) for key, stats in counts.newest().items()}
     for role, id in sorted({*up, *newest}):
         made.add(Gauge, "process_up", {"role": role, "id": id}, float((role, id) in up))
@@ -129,7 +133,7 @@ def _add_processes(made: _Families, counts: Counts, up: Collection[tuple[str, st
             _add_counted(made, kind, wire, [(each, values[wire]) for each, values in told if wire in values])
 
 
-def _add_counted(made: _Families, kind: Any, wire: str, told: Iterable[tuple[dict[str, str], Any]]) -> None:
+def _add_counted(made: Families, kind: Any, wire: str, told: Iterable[tuple[dict[str, str], Any]]) -> None:
     """Adds what processes count under one name, which may be any text."""
     name, worth, text = named(wire)
     split = next((start for start in _SPLIT if kind is Gauge and wire.startswith(start)), None)
@@ -168,16 +172,6 @@ def _buckets(buckets: Mapping[int, int], worth: float) -> tuple[list[tuple[str, 
     return [*under, ("+Inf", float(histogram.count))], math.fsum(value * count for value, count in values)
 
 
-class OneScrape(Collector):
-    """Registry interface of `choose_encoder`'s formats."""
-
-    def __init__(self, families: Iterable[Metric]) -> None:
-        self._families = families
-
-    def collect(self) -> Iterable[Metric]:
-        return self._families
-
-
 class MetricsEndpoint:
     """Answers `/metrics`, in the format that the visitor asks for, with what the owner of the figures makes at its
     next call of `answer`: a visitor's thread only leaves a question and waits. Without a scrape, nothing is made.
@@ -187,26 +181,26 @@ class MetricsEndpoint:
     """
 
     def __init__(self, port: int, processes: Callable[[], Sequence[Process]], address: str = LOOPBACK) -> None:
-        self._waiting: queue.SimpleQueue[Future[list[Metric]]] = queue.SimpleQueue()
+        self._waiting: queue.SimpleQueue[Future[Families]] = queue.SimpleQueue()
         pages = {"/metrics": self._scraped, **health_pages(processes)}
         self._server = Server("metrics port", port, pages, address)
         self.url = f"{self._server.url}/metrics"
         self.close = self._server.close
 
-    def answer(self, make: Callable[[], list[Metric]]) -> None:
+    def answer(self, make: Callable[[], Families]) -> None:
         """Answers all who wait. Called by the thread that owns the figures, several times a second."""
-        made: list[Metric] | None = None
+        made: Families | None = None
         while not self._waiting.empty():
             waiting = self._waiting.get()
             made = make() if made is None else made
             waiting.set_result(made)
 
     def _scraped(self, query: str, headers: Message) -> Reply:
-        waiting: Future[list[Metric]] = Future()
+        waiting: Future[Families] = Future()
         self._waiting.put(waiting)
         try:
             found = waiting.result(_SCRAPE_WAITS_S)
         except TimeoutError:
             return Reply(503, "text/plain", b"the swarm's observer is busy; ask again\n")
         encode, content_type = choose_encoder(headers.get("accept", ""))
-        return Reply(200, content_type, encode(OneScrape(found)))
+        return Reply(200, content_type, encode(found))

@@ -7,7 +7,7 @@ from prometheus_client.openmetrics.parser import text_string_to_metric_families
 from support.makers import planner_status, stats
 
 from launch_scripts.observe.summed_counts import Counts
-from launch_scripts.web.prometheus import HELP, OneScrape, Run, families
+from launch_scripts.web.prometheus import HELP, Run, families
 from shared_map.keeper.service import THROTTLED
 from swarm.runtime.stats import CAPTURES_OF, GAPS_TO, READY, Counters
 from swarm.wire.messages.vehicles import VehicleState
@@ -34,9 +34,7 @@ def exported() -> dict[str, set[str]]:
     counts = Counts()
     counts.count(stats(counters=counters))
     status = planner_status(pose_age_s=0.5, tracker_lost=True)
-    text = generate_latest(
-        OneScrape(families(Run("r", "demo", 1), counts, {"t0": status}, [("agent", "a0")]))
-    ).decode()
+    text = generate_latest(families(Run("r", "demo", 1), counts, {"t0": status}, [("agent", "a0")])).decode()
     found: dict[str, set[str]] = {}
     for family in text_string_to_metric_families(text):
         for sample in family.samples:

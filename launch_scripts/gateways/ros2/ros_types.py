@@ -1,12 +1,14 @@
 """ROS types by distribution: their messages, CDR and hashes. rosbags knows them; two things are repaired here.
 
 rosbags hashes `char` as a type of its own, ROS 2 as uint8, which changes every service's hash (ServiceEventInfo has
-a char[16]). And it knows no services, so those in use are stated below, with the message that it lacks.
+a char[16]). And it knows no services, so those in use are in `added_types.toml`, with the message that it lacks.
 """
 
 from __future__ import annotations
 
+import tomllib
 from functools import cache
+from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
@@ -25,17 +27,7 @@ _EVENT_INFO = "service_msgs/msg/ServiceEventInfo"
 _GID: Any = (Nodetype.ARRAY, ((Nodetype.BASE, ("uint8", 0)), 16))
 Distribution = Literal["humble", "jazzy", "kilted", "lyrical", "rolling"]
 """ROS 2 distribution of the peers: it determines the hashes of types, which are part of every key."""
-_ADDED = {
-    "map_msgs/msg/OccupancyGridUpdate": "std_msgs/Header header\nint32 x\nint32 y\n"
-    "uint32 width\nuint32 height\nint8[] data",
-    "std_srvs/srv/Trigger_Request": "",
-    "std_srvs/srv/Trigger_Response": "bool success\nstring message",
-    "nav_msgs/srv/GetMap_Request": "",
-    "nav_msgs/srv/GetMap_Response": "nav_msgs/OccupancyGrid map",
-    "nav_msgs/srv/GetPlan_Request": "geometry_msgs/PoseStamped start\ngeometry_msgs/PoseStamped goal\n"
-    "float32 tolerance",
-    "nav_msgs/srv/GetPlan_Response": "nav_msgs/Path plan",
-}
+_ADDED: dict[str, str] = tomllib.loads(Path(__file__).with_name("added_types.toml").read_text(encoding="utf-8"))
 """Name -> definition, as .msg files have it."""
 
 

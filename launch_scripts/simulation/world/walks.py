@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shared_map.array_files import Bools, CellsOf
-from shared_map.terrain.pace_layers import largest_part
+from shared_map.terrain.pace_layers import largest_part, nearest_open
 from shared_map.terrain.slope_and_climb import Climb
 from swarm.config.ground import CostConfig
 from swarm.config.scenario import TargetConfig
@@ -82,10 +82,9 @@ class TrueTerrain:
 
     def nearest(self, cell: int) -> int:
         """The passable cell nearest to a cell, which may be itself."""
-        row, col = divmod(cell, self.grid.cols)
-        rows, cols = np.nonzero(np.isfinite(self.pace_s_per_m))
-        best = int(((rows - row) ** 2 + (cols - col) ** 2).argmin())
-        return int(rows[best]) * self.grid.cols + int(cols[best])
+        nearest = nearest_open(np.isfinite(self.pace_s_per_m), *divmod(cell, self.grid.cols))
+        assert nearest is not None  # a terrain has a passable cell
+        return self.grid.cell(*nearest)
 
     def random_home(self, chance: random.Random) -> int:
         return self._home.cell(chance.randrange(len(self._home)))

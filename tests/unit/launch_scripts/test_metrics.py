@@ -10,7 +10,6 @@ from pathlib import Path
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from prometheus_client.metrics_core import Metric
 from prometheus_client.openmetrics.parser import text_string_to_metric_families
 from prometheus_client.parser import text_string_to_metric_families as plain_families
 from support.exported_metrics import exported
@@ -18,7 +17,7 @@ from support.makers import planner_status, stats
 
 from launch_scripts import web
 from launch_scripts.observe.summed_counts import Counts
-from launch_scripts.web.prometheus import HELP, MetricsEndpoint, Run, families, named
+from launch_scripts.web.prometheus import HELP, Families, MetricsEndpoint, Run, families, named
 from swarm.clock import NS_PER_S
 from swarm.runtime.stats import CAPTURES_OF, GAPS_TO, Counters
 from swarm.wire.messages.processes import Stats
@@ -31,7 +30,7 @@ def _stats(role: str, id: str, counters: Counters, generation: int = _BEGAN_NS) 
 
 
 @pytest.fixture
-def figures() -> list[Metric]:
+def figures() -> Families:
     counts, agent, targets = Counts(), Counters(), Counters()
     agent.count("messages_out", 40)
     agent.count("ticks_late", 3)
@@ -51,7 +50,7 @@ def figures() -> list[Metric]:
 
 
 def _scraped(
-    endpoint: MetricsEndpoint, figures: list[Metric], path: str = "/metrics", **headers: str
+    endpoint: MetricsEndpoint, figures: Families, path: str = "/metrics", **headers: str
 ) -> tuple[int, str]:
     """Status and text of a scrape, answered by this thread as its owner would."""
     found: list[tuple[int, str]] = []
@@ -87,7 +86,7 @@ def _samples(text: str) -> dict[tuple[str, ...], float]:
     }
 
 
-def test_a_scrape_says_what_processes_said(endpoint: MetricsEndpoint, figures: list[Metric]) -> None:
+def test_a_scrape_says_what_processes_said(endpoint: MetricsEndpoint, figures: Families) -> None:
     status, text = _scraped(endpoint, figures, accept="application/openmetrics-text; version=1.0.0")
     found = _samples(text)
     assert status == 200
@@ -109,7 +108,7 @@ def test_a_scrape_says_what_processes_said(endpoint: MetricsEndpoint, figures: l
     assert under["le=+Inf"] == 4
 
 
-def test_prometheus_of_any_age_reads_it(endpoint: MetricsEndpoint, figures: list[Metric]) -> None:
+def test_prometheus_of_any_age_reads_it(endpoint: MetricsEndpoint, figures: Families) -> None:
     _, text = _scraped(endpoint, figures)
     assert {family.name for family in plain_families(text)} >= {"swarm_captures", "swarm_route_query_seconds"}
 
@@ -131,12 +130,10 @@ def test_no_name_from_the_network_breaks_a_scrape(
 ) -> None:
     from prometheus_client.openmetrics.exposition import generate_latest
 
-    from launch_scripts.web.prometheus import OneScrape
-
     heard = Counts()
     heard.count(stats(counts=counts, gauges=gauges, histograms=histograms))
     run = Run('a"\n\\b', "demo", _BEGAN_NS)
-    text = generate_latest(OneScrape(families(run, heard, {}, [("agent", "a0")]))).decode()
+    text = generate_latest(families(run, heard, {}, [("agent", "a0")])).decode()
     found = _samples(text)
     assert found["swarm_process_up", "id=a0", "role=agent"] == 1
     assert found["swarm_run_info", 'run_id=a"\n\\b', "scenario=demo"] == 1

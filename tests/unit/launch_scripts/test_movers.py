@@ -239,15 +239,13 @@ def test_routes_of_one_tree_are_drawn_whole_and_no_part_of_them_twice(data: st.D
     starts = data.draw(st.lists(st.integers(0, nodes - 1), max_size=12))
     mesh = TerrainMesh(hill(1, nodes))
     routes = [route(*on_tree(parents, start)) for start in starts]
-    lines = view.RouteLines(mesh, 1)
-    for _ in range(2):  # earlier drawings leave nothing behind
-        strips = lines.lines(routes)
-        drawn = []
-        for n in range(many(strips)):
-            cells = (line(strips, n)[:, 0] / 10 - 0.5).round().astype(int).tolist()
-            drawn += list(itertools.pairwise(cells))
-        assert len(drawn) == len(set(drawn))
-        assert set(drawn) == {edge for each in routes for edge in itertools.pairwise(each.cells.tolist())}
+    strips = view.route_lines(mesh, 1, routes)
+    drawn = []
+    for n in range(many(strips)):
+        cells = (line(strips, n)[:, 0] / 10 - 0.5).round().astype(int).tolist()
+        drawn += list(itertools.pairwise(cells))
+    assert len(drawn) == len(set(drawn))
+    assert set(drawn) == {edge for each in routes for edge in itertools.pairwise(each.cells.tolist())}
 
 
 def test_a_trail_grows_by_what_was_driven_and_breaks_where_something_jumped() -> None:

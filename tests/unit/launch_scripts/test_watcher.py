@@ -14,7 +14,7 @@ from support.target_reports import fleet
 
 from launch_scripts.launcher.run_options import UpOptions
 from launch_scripts.launcher.watcher import OwnPart, Watcher
-from launch_scripts.observe.alarms import EVIDENCE, KINDS, alarms_of
+from launch_scripts.observe.alarms import KINDS, alarms_of
 from launch_scripts.observe.recorder import Recorder
 from launch_scripts.process_table import ProcessSpec, processes_of
 from swarm.bus.bus import Appeared, Disappeared
@@ -184,10 +184,9 @@ def test_an_alarm_is_opened_only_by_a_launcher_that_hears_what_closes_it(records
     part.swarm.deliveries.clear()
     part.speak()
     latest = part.known.observed
-    for kind in KINDS:
-        evidence = EVIDENCE.get(kind, (STATS,))
-        if set(evidence) <= set(latest.hears):
-            assert {topic.name for topic in evidence} <= set(part.deliveries()), kind
+    for word, kind in KINDS.items():
+        if kind.opened_by <= {topic.name for topic in latest.hears}:
+            assert kind.opened_by <= set(part.deliveries()), word
     alarms = alarms_of(latest, ("t0", "t1", "t2"), part.swarm.now_ns)
     assert not [alarm for alarm in alarms if alarm.kind == "target-lost"]
 
