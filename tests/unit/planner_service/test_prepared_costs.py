@@ -59,8 +59,7 @@ def test_a_tree_on_shared_costs_is_the_one_on_its_own_to_the_bit_whatever_is_mar
 
 def test_planners_of_a_machine_share_one_file(tmp_path: Path) -> None:
     terrain = mapped(tmp_path)
-    one = shared_costs(tmp_path, terrain, CONFIG)
-    assert one is not None
+    one = np.asarray(shared_costs(tmp_path, terrain, CONFIG))
     assert not one.flags.writeable
     file = (tmp_path / COSTS).stat().st_ino
     np.testing.assert_array_equal(one, shared_costs(tmp_path, terrain, CONFIG))
