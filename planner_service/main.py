@@ -10,7 +10,7 @@ from contextlib import closing
 from planner_service.growth_times import is_slow_to_grow
 from planner_service.kernel_build import KernelLoader, NeededKernels, needed_kernels, place_kernels
 from planner_service.places_service import PlacesService
-from planner_service.planning_process import PREPARED_COSTS, Planning, prepared_costs
+from planner_service.planning_process import Planning, shared_costs
 from planner_service.service import PlannerService
 from shared_map.terrain.store import load_terrain
 from shared_map.terrain.terrain import Terrain
@@ -36,12 +36,12 @@ def run(setup: RoleSetup, built: Callable[[], None]) -> None:
         raise ConfigError(f"scenario {scenario.name} has no target {target}; it has {ids}")
     terrain = _load_ground(setup)
     kernels = _load_kernels(needed_kernels(scenario), whole=is_slow_to_grow(terrain.grid))
-    prepared = prepared_costs(setup.run_dir, terrain, scenario.planner)
+    costs = shared_costs(setup.run_dir, terrain, scenario.planner)
 
     def make(boundary: Boundary, planning: Planning) -> Service:
         stopwatch = boundary.function("stopwatch", time.thread_time_ns, int)
         all_kernels = boundary.function("all kernels", lambda: kernels.complete, bool)
-        return PlannerService(planning, all_kernels, stopwatch, boundary.external(prepared, PREPARED_COSTS))
+        return PlannerService(planning, all_kernels, stopwatch, costs)
 
     _serve(setup, terrain, built, make, "grow-tree", JobSlots(setup.run_dir))
 

@@ -1,27 +1,22 @@
 """The set-up that all processes which plan routes share: the network, who leads, orders, the map of each class.
 
-The cell costs of a map are shared by its planners on one machine, in files of the run's folder. One process
-computes them; all memory-map the file. A file's name is the digest of all that it follows from, so that it cannot
-be another map's.
+The cell costs of a map are shared by its planners on one machine, in a file of the run's folder. To compute them
+takes less time than to check a digest of them, so each planner does, and keeps the file in place of its own.
 """
 
 from __future__ import annotations
 
 import contextlib
 import fcntl
-import hashlib
 import logging
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
 
-from planner_service.tree.cost_grid import CostGrid
-from shared_map import array_files as arrays
-from shared_map.array_files import Floats, open_array, private_copy, save_array, source_digest
+from planner_service.tree.cost_grid import NO_COSTS, CostGrid
+from shared_map.array_files import Floats, open_array, private_copy, save_array
 from shared_map.cost_map import CostMap
 from shared_map.learned_factors import LearnedGauges
 from shared_map.replication.interest import MarkFilter
@@ -35,7 +30,6 @@ from swarm.config.scenario import PlannerConfig, agent_of
 from swarm.config.vehicle_classes import GROUND, class_numbers, first_classes
 from swarm.errors import StoreError
 from swarm.peers import job_of
-from swarm.recording.service_boundary import ExternalCalls
 from swarm.runtime.election import Candidacy
 from swarm.runtime.membership import Member, MemberService
 from swarm.runtime.order_book import OrderClient
@@ -47,78 +41,32 @@ from swarm.wire.topics import PUSHED_ROUTE, Topic
 log = logging.getLogger(__name__)
 
 
-PREPARED_COSTS = ExternalCalls("prepared costs", calls={}, fixed=("cell_cost",))
-"""The part of it that a planner uses."""
+def shared_costs(folder: Path | None, terrain: Terrain, config: PlannerConfig) -> Floats | None:
+    """Returns the cell costs before any mark, which a `CostGrid` can share: float32, padded, s; mapped read-only.
 
-
-_DIGEST_BYTES = 16
-"""Same length as in names of cached terrains: no two arrays of one machine have the same by chance."""
-
-
-class PreparedCosts:
-    """Cell costs before any mark.
-
-    cell_cost  float32, padded, s: what a `CostGrid` loads; mapped read-only
+    A file with other costs, those of another map or damaged ones, is replaced. Returns None where there is no
+    folder or it cannot be written: then a planner keeps its own.
     """
-
-    def __init__(self, folder: Path, terrain: Terrain, config: PlannerConfig) -> None:
-        cost_grid = CostGrid(terrain.grid, config, terrain.climb)
-        of_costs = f"{terrain.digest} {terrain.grid} {cost_grid.metres}"
-        path = folder / f"cell-costs-{_digest(of_costs)}.npy"
-        with _locked(folder / "cell-costs.lock"):
-            found = _read(path, cost_grid.size)
-            if found is None:
-                cost_grid.load(private_copy(terrain.pace_s_per_m))  # kernels know arrays that may be written only
-                save_array(path, np.concatenate((cost_grid.time_cost, _digest_of(cost_grid.time_cost))))
-                found = open_array(path)[: cost_grid.size]
-        self.cell_cost: Floats = found
-
-
-def prepared_costs(folder: Path | None, terrain: Terrain, config: PlannerConfig) -> PreparedCosts | None:
-    """None where there is no folder or it cannot be written: then a planner computes its own."""
     if folder is None:
         return None
+    path = folder / "cell-costs.npy"
     try:
-        return PreparedCosts(folder, terrain, config)
+        # One at a time: each maps the file of the first, and there is memory for one more array only.
+        with (folder / "cell-costs.lock").open("wb") as lock:
+            fcntl.flock(lock, fcntl.LOCK_EX)
+            own = CostGrid(terrain.grid, config, terrain.climb)
+            own.load(private_copy(terrain.pace_s_per_m))  # kernels know arrays that may be written only
+            found: Floats = NO_COSTS
+            with contextlib.suppress(OSError, ValueError):
+                found = open_array(path)
+            if not np.array_equal(found, own.time_cost):
+                log.info("writing the cell costs of this map to %s", path)
+                save_array(path, own.time_cost)
+                found = open_array(path)
+            return found
     except (OSError, StoreError) as error:
         log.warning("cannot share cell costs in %s: %s", folder, error)
         return None
-
-
-def _digest(text: str) -> str:
-    here = Path(__file__).parent
-    code = source_digest(here / "tree", here / "kernels", Path(arrays.__file__).parent)
-    return hashlib.blake2b(f"{code} {text}".encode(), digest_size=8).hexdigest()
-
-
-def _digest_of(array: NDArray[Any]) -> NDArray[Any]:
-    """The digest of an array, as elements of its type."""
-    return np.frombuffer(hashlib.blake2b(array.data, digest_size=_DIGEST_BYTES).digest(), array.dtype)
-
-
-def _read(path: Path, size: int) -> Floats | None:
-    """The array before its digest. None if the file is missing; a damaged one counts as missing, and is logged:
-    kernels check no index that they read from it."""
-    try:
-        whole = open_array(path)
-        if whole.dtype != np.float32 or whole.shape != (size + _DIGEST_BYTES // whole.itemsize,):
-            raise ValueError(f"it is {whole.shape} {whole.dtype}")
-        found = whole[:size]
-        if whole[size:].tobytes() != _digest_of(found).tobytes():
-            raise ValueError("its digest is another")
-    except FileNotFoundError:
-        return None
-    except (OSError, ValueError) as error:
-        log.warning("%s is damaged (%s): computing it again", path, error)
-        return None
-    return found
-
-
-@contextlib.contextmanager
-def _locked(path: Path) -> Iterator[None]:
-    with path.open("wb") as lock:
-        fcntl.flock(lock, fcntl.LOCK_EX)
-        yield
 
 
 @dataclass(frozen=True, slots=True)

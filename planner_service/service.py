@@ -10,12 +10,13 @@ import msgspec
 
 from planner_service.kernels.stride_networks import StrideNetwork
 from planner_service.planner import Action, Answer, Planner, Refusal, Work
-from planner_service.planning_process import Planning, PlanningProcess, PreparedCosts
+from planner_service.planning_process import Planning, PlanningProcess
 from planner_service.strategy import StrategyWorld, strategy_of
 from planner_service.target_search import TargetSearch, hidden_target
 from planner_service.target_tree import TargetTree
 from planner_service.tracker_notes import TargetWatch
 from planner_service.tree.partitioned_tree import GrownTree
+from shared_map.array_files import Floats
 from shared_map.cost_map import CostMap
 from shared_map.replication.interest import readable_for_target
 from shared_map.sightings import Presence, Sightings, pose_of
@@ -58,6 +59,7 @@ class PlannerService(PlanningProcess):
 
     stopwatch     the CPU time of this thread, ns, that growths on it are timed with; a simulation gives none, and a
                   model is used
+    shared_costs  cell costs of the terrain before any mark; None: it computes them. Nothing else depends on it
     """
 
     def __init__(
@@ -65,7 +67,7 @@ class PlannerService(PlanningProcess):
         planning: Planning,
         all_kernels: Callable[[], bool] | None = None,
         stopwatch: Callable[[], int] | None = None,
-        prepared: PreparedCosts | None = None,
+        shared_costs: Floats | None = None,
     ) -> None:
         setup, grid = planning.setup, planning.terrain.grid
         scenario, self._target = setup.scenario, job_of(setup.id)
@@ -73,7 +75,7 @@ class PlannerService(PlanningProcess):
         key = {"target": self._target}
         served = dict.fromkeys((topics.ROUTE, topics.COST, topics.NAMELESS_ROUTE, topics.NAMELESS_COST), key)
         super().__init__(planning, self._heard_groups, served, all_kernels)
-        self._stopwatch, self._prepared = stopwatch, prepared
+        self._stopwatch = stopwatch
         # Position of the target.
         self._watch = TargetWatch(self._target, grid, self.counters, leads=False)
         self._untracked = self._target in scenario.untracked
@@ -87,8 +89,8 @@ class PlannerService(PlanningProcess):
         world = StrategyWorld(self._target, grid, scenario.planner)
         self._chosen_by = strategy_of(named_plugin(scenario, "planner.strategy"), world, self._faults.append)
         tree = self._new_tree(self._cost_maps[GROUND])
-        if prepared is not None:
-            tree.share(prepared.cell_cost)
+        if shared_costs is not None:
+            tree.share(shared_costs)
         hidden = hidden_target(scenario, self._target, setup.incarnation)
         self._search = TargetSearch(hidden, tree.cost_grid, scenario.time_scale)
         self._planner = self._new_planner(GROUND, self._cost_maps[GROUND], tree)

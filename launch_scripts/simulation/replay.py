@@ -3,7 +3,6 @@ fed, and compared with what it did."""
 
 from __future__ import annotations
 
-import tempfile
 from collections import Counter
 from collections.abc import Iterator
 from pathlib import Path
@@ -13,12 +12,10 @@ import msgspec
 
 from launch_scripts.process_table import SIMULATED_ROLES
 from launch_scripts.simulation.simulate import built
-from planner_service.planning_process import PreparedCosts
 from shared_map.array_files import Floats
 from shared_map.terrain.store import load_terrain, load_truth
 from shared_map.terrain.terrain import Terrain
 from shared_map.vehicle_class_grounds import load_classes
-from swarm.config.scenario import Scenario
 from swarm.config.scenario_files import parse_scenario
 from swarm.errors import ConfigError, StoreError, SwarmError, TerrainError
 from swarm.recording.record_inputs import versions
@@ -38,18 +35,6 @@ def setup_of(head: Head, folder: Path) -> RoleSetup:
     given["scenario"] = parse_scenario(head.scenario)
     given["before"] = decode(head.before, Stats) if head.before else None
     return RoleSetup(**given, run_dir=folder)
-
-
-class _Costs:
-    """Data that planners of a machine share and that follows from scenario and terrain."""
-
-    def __init__(self, terrain: Terrain, scenario: Scenario) -> None:
-        self._of = terrain, scenario.planner
-
-    @property
-    def cell_cost(self) -> Floats:
-        with tempfile.TemporaryDirectory() as folder:
-            return PreparedCosts(Path(folder), *self._of).cell_cost
 
 
 class Recorded(NamedTuple):
@@ -154,8 +139,7 @@ def _outcome(
 
     def make(boundary: Replaying) -> Service:
         nobody: Any = boundary.nobody  # what the process sent itself is in the recording, too
-        outside = _Costs(terrain, setup.scenario) if head.role == "planner" else None
-        return built(setup, terrain, truth, boundary, nobody, nobody, lambda event: None, outside)
+        return built(setup, terrain, truth, boundary, nobody, nobody, lambda event: None)
 
     with RecordReader(recorded.path) as reader:
         return replay(reader, make, setup.scenario.network.namespace, until_s)

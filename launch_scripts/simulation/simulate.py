@@ -29,7 +29,7 @@ from launch_scripts.simulation.world.walks import WAY_MODULES
 from planner_service.kernel_build import needed_kernels, place_kernels
 from planner_service.kernels.decorators import load
 from planner_service.places_service import PlacesService
-from planner_service.planning_process import PREPARED_COSTS, Planning
+from planner_service.planning_process import Planning
 from planner_service.service import PlannerService
 from shared_map.array_files import Floats
 from shared_map.keeper.mark_store import KEEPER_STORE, KeeperStore
@@ -69,8 +69,7 @@ def built(
 ) -> Service:
     """The service of a process that is simulated or replayed. Raises StoreError on a role that has none.
 
-    outside  store of a keeper, promises of an agent, prepared costs of a planner; None: there are none, or a
-             recording has their readings
+    outside  store of a keeper, promises of an agent; None: there are none, or a recording has their readings
     """
     bus = boundary.bus(bus)
     match setup.role:
@@ -82,11 +81,10 @@ def built(
         case "planner":
             stopwatch: Callable[[], int] | None = boundary.function("stopwatch", None, int)
             kernels: Callable[[], bool] | None = boundary.function("all kernels", None, bool)
-            prepared = boundary.external(outside, PREPARED_COSTS)
             for kernel in needed_kernels(setup.scenario):
                 load(kernel)
             planning = Planning(setup, terrain, bus, post, boundary.worker(worker))
-            return PlannerService(planning, kernels, stopwatch, prepared)
+            return PlannerService(planning, kernels, stopwatch)
         case "places":
             of_places: Callable[[], bool] | None = boundary.function("all kernels", None, bool)
             for kernel in place_kernels(setup.scenario):

@@ -1,9 +1,10 @@
 """Costs of the pieces of a tree, and pairs of pieces whose totals have come apart, so that a tile is to be checked.
 
 If no cell was offered less, a cell of another piece is the source of a better offer only if its own piece's total
-has risen by more than that one's. A tile is therefore checked where two pieces *meet*, have cells beside each
-other, and one of them has risen by more than the other. The state of a tile is one number, the largest amount by
-which all changes since its check may lower an offer to a cell (`Tiles.falls`).
+has risen by more than that one's. A tile is therefore checked where one of its pieces has risen by more than
+another of them, or than one of a tile beside it which it *meets*: the two have cells beside each other. The
+state of a tile is one number, the largest amount by which all changes since its check may lower an offer to a cell
+(`Tiles.falls`).
 
 A piece that loses its path keeps its last cost, and once it has a path again its change is reckoned from that: a
 branch behind a closed path mostly comes back as it was, at a higher cost, and is then checked along its edge only.
@@ -18,9 +19,8 @@ import numpy as np
 from planner_service.kernels import tile_pieces
 from planner_service.kernels.decorators import helper, kernel, prefetch
 from planner_service.kernels.layout import GRID, NONE, check_cells
-from planner_service.kernels.tile_pieces import BITS, CELLS, INSIDE, OFFSET, PIECES, SIDE, SUCCESSOR, TOTAL, WIDE
+from planner_service.kernels.tile_pieces import BITS, CELLS, INSIDE, OFFSET, PIECES, SIDE, SUCCESSOR, TOTAL
 
-_ONE = np.uint64(1)
 _DRIFT = 4.0
 """Multiple of `FINEST` by which a tile's totals may come apart before it is checked."""
 _EVEN = 2.0**-4
@@ -73,50 +73,6 @@ def note_changes(t, tree, tiles):
 
 
 @helper
-def _differ(a, b):
-    """uint8, not 0: whether two groups differ, and both are some."""
-    return np.uint8((a != b) & (a != tile_pieces.NO_PIECE) & (b != tile_pieces.NO_PIECE))
-
-
-@helper
-def _meet_inside(t, tree, tiles, scratch, fine):
-    """Returns True if two pieces of a tile beside each other have totals that changed by different numbers, more
-    than `fine` apart."""
-    piece, total = tree.piece, tree.total
-    exits, many = tiles.exits, tiles.many
-    name, changes, group_of = scratch.name, scratch.changes, scratch.queue
-    # Pieces are grouped by what their totals have changed by.
-    groups = 0
-    for j in range(many[t]):
-        one = np.int64(exits[t * PIECES + j])
-        change = _change(total, t * PIECES + one)
-        group = 0
-        while group < groups and abs(change - changes[group]) > fine:
-            group += 1
-        if group == groups:
-            if groups == changes.size:
-                return True
-            changes[groups] = change
-            groups += 1
-        group_of[one] = group
-    group_of[tile_pieces.NO_PIECE] = np.int32(tile_pieces.NO_PIECE)
-    for row in range(SIDE):
-        i, at = np.uint64(t * CELLS + (row << BITS)), np.uint64((row + 1) * WIDE + 1)
-        for col in range(np.uint64(SIDE)):
-            name[at + col] = group_of[piece[i + col]]
-    for row in range(1, SIDE + 1):
-        at, s = np.uint64(row * WIDE), np.uint64(WIDE)
-        other = np.uint8(0)
-        for col in range(_ONE, np.uint64(SIDE) + _ONE):
-            here = name[at + col]
-            other |= _differ(here, name[at + col + _ONE]) | _differ(here, name[at + s + col])
-            other |= _differ(here, name[at + s + col + _ONE]) | _differ(here, name[at + s + col - _ONE])
-        if other:
-            return True
-    return False
-
-
-@helper
 def _meet(t, other, across, tree, schedule, fine):
     """Returns True if along the border of a tile a piece's total has risen by more than that of one beside it, of
     tile `other`; by more than `fine`."""
@@ -143,11 +99,11 @@ def _meet(t, other, across, tree, schedule, fine):
 
 
 @helper
-def _any_meet(t, tree, tiles, scratch, schedule, fine):
-    """Returns True if a piece of a tile has risen by more than one beside it, in the tile or about it; by more than
-    `fine`."""
+def _any_meet(t, tree, tiles, schedule, fine):
+    """Returns True if a piece of a tile has risen by more than another in it, or than one beside it about the tile;
+    by more than `fine`. In a tile, two such pieces are nearly always beside each other."""
     falls, across = tiles.falls, tiles.across
-    if falls[1, t] > falls[0, t] + fine and _meet_inside(t, tree, tiles, scratch, fine):
+    if falls[1, t] > falls[0, t] + fine:
         return True
     row0, col0, row1, col1 = tile_pieces.rows_about(t, across, falls.shape[1])
     for row in range(row0, row1):
@@ -182,7 +138,7 @@ def _rise(t, tiles):
 
 
 @helper
-def queue_checks(tree, tiles, scratch, schedule):
+def queue_checks(tree, tiles, schedule):
     """Puts tiles into `CHECKING` that are to be checked: where it is wanted, and where a piece's total has risen by
     more than that of one beside it since they were looked at. Only tiles about which totals have changed, and those
     of `NEARBY`, are asked; others stay in it or out of it."""
@@ -201,7 +157,7 @@ def queue_checks(tree, tiles, scratch, schedule):
         t = order[n]
         nearest = ends[0, t] if ends[0, t] < np.inf else 0.0
         rise, fine = _rise(t, tiles), _EVEN * tile_pieces.FINEST * nearest
-        if rise > 2.0 * fine and not _any_meet(t, tree, tiles, scratch, schedule, fine):
+        if rise > 2.0 * fine and not _any_meet(t, tree, tiles, schedule, fine):
             rise = 2.0 * fine
         falls[2, t] += rise
         risen = ends[0, t] < np.inf and falls[2, t] > _DRIFT * tile_pieces.FINEST * nearest
@@ -373,7 +329,7 @@ def add_up(grid, tree, tiles, scratch, schedule):
     """Evaluates totals, and note where they have risen."""
     begin(tiles, schedule)
     evaluate_totals(grid, tree, tiles, scratch.border, schedule, schedule.now)
-    queue_checks(tree, tiles, scratch, schedule)
+    queue_checks(tree, tiles, schedule)
 
 
 @kernel(GRID, tile_pieces.TREE, tile_pieces.SCRATCH, "i8", "i8[::1]", "f8[::1]")

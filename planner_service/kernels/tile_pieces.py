@@ -167,8 +167,6 @@ class Scratch(NamedTuple):
     """(m + 1,) which tile is in each place, -1 if none; behind, the place that goes next."""
     spot: Ints
     """(w,) where in the heap a cell is; -1 between calls."""
-    changes: Doubles
-    """(16,) s; different changes of totals of a tile."""
 
 
 class Schedule(NamedTuple):
@@ -214,7 +212,6 @@ def make_scratch(tiles: int, most: int) -> Scratch:
         place=np.full(tiles, -1, np.int32),
         holder=np.append(np.full(places, -1), 0).astype(np.int32),
         spot=np.full(size, -1, np.int32),
-        changes=np.zeros(16),
     )
 
 

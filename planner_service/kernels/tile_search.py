@@ -253,7 +253,7 @@ def improve_tiles(grid, tree, tiles, scratch, schedule, most):
     evaluate_totals(grid, tree, tiles, scratch.border, schedule, now)
     while True:
         rounds += 1
-        queue_checks(tree, tiles, scratch, schedule)
+        queue_checks(tree, tiles, schedule)
         n = tile_pieces.next_in(tile_pieces.CHECKING, 0, sets, words)
         if n >= order.size or looked + 2 * mended > most:
             return looked, mended, rounds, n < order.size

@@ -34,13 +34,11 @@ class ExternalCalls:
     name   of it, in the recording
     calls  method -> type of what it returns; its arguments are outputs of the service
     facts  attribute -> its type
-    fixed  attributes that follow from scenario and terrain: nothing is recorded of them
     """
 
     name: str
     calls: Mapping[str, Any] = field(default_factory=dict)
     facts: Mapping[str, Any] = field(default_factory=dict)
-    fixed: tuple[str, ...] = ()
 
 
 def _plain(value: object) -> object:
@@ -306,8 +304,6 @@ class BoundaryObject:
 
     def __getattr__(self, name: str) -> Any:
         what, crossing = self._what, self._crossing
-        if name in what.fixed:
-            return getattr(self._thing, name)
         if name in what.facts:
             return crossing.read_as(name, lambda: getattr(self._thing, name), what.facts[name])
         if name not in what.calls:

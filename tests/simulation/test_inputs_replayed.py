@@ -16,17 +16,18 @@ from support.simulated import simulate
 from typer.testing import CliRunner
 
 from launch_scripts.commands.result_commands import app
+from launch_scripts.simulation import simulate as simulating
 from launch_scripts.simulation.faults import random_plan
 from launch_scripts.simulation.replay import recordings_of, replay_run
 from launch_scripts.simulation.sample_worlds import SMALL
-from planner_service.planning_process import PREPARED_COSTS, PreparedCosts
+from planner_service.planning_process import shared_costs
+from planner_service.service import PlannerService
 from shared_map.terrain.terrain import build_terrain
 from swarm.errors import ConfigError, StoreError
 from swarm.recording import recording_file
 from swarm.recording.record_inputs import Recording
 from swarm.recording.recording_file import MAGIC, Called, Handled, Output, Outputs, Record, RecordReader, packed
 from swarm.recording.replay_service import Outcome
-from swarm.recording.service_boundary import ExternalCalls
 from swarm.runtime.role_setup import RoleSetup
 from vehicle_agent.agent import Agent
 
@@ -84,27 +85,24 @@ def test_what_planners_read_of_clock_and_kernels_is_input(tmp_path: Path, monkey
     scenario = msgspec.structs.replace(
         SMALL, seed=4, planner=msgspec.structs.replace(SMALL.planner, strategy="multi_resolution")
     )
-    terrain = build_terrain(scenario)
+    shared = shared_costs(tmp_path, build_terrain(scenario), scenario.planner)
     calls = itertools.count()
-    # The inputs of a live planner: CPU time, kernels that are compiled by and by, networks in files.
-    live = {
+    # The inputs of a live planner: CPU time, kernels that are compiled by and by.
+    of_live = {
         "stopwatch": time.thread_time_ns,
         "all kernels": lambda: next(calls) > 40,
         "modules of zones": lambda: True,
     }
-    function, outside = Recording.function, Recording.external
+    function = Recording.function
 
     def functions(self: Recording, name: str, given: object, kind: Any) -> Any:
-        return function(self, name, live[name], kind)
+        return function(self, name, of_live[name], kind)
 
-    def shelves(self: Recording, thing: object, what: ExternalCalls) -> Any:
-        if what is PREPARED_COSTS:
-            thing = PreparedCosts(tmp_path, terrain, scenario.planner)
-        return outside(self, thing, what)
-
-    monkeypatch.setattr(Recording, "function", functions)
-    monkeypatch.setattr(Recording, "external", shelves)
-    simulate(scenario, seconds=3, record_to=tmp_path)
+    with monkeypatch.context() as live:
+        live.setattr(Recording, "function", functions)
+        live.setattr(simulating, "PlannerService", lambda *given: PlannerService(*given, shared))
+        simulate(scenario, seconds=3, record_to=tmp_path)
+    # These planners compute their own cell costs.
     for process in ("planner-t0", "planner-t1"):
         (replayed,) = replay_run(tmp_path, process)
         assert replayed.same, replayed

@@ -1,13 +1,12 @@
 """Data that the planners of a machine share: the same as each would compute, and never another map's."""
 
-import logging
 from pathlib import Path
 
 import numpy as np
 import pytest
 from support.planner_strategies import random_pace
 
-from planner_service.planning_process import PreparedCosts, prepared_costs
+from planner_service.planning_process import shared_costs
 from planner_service.target_tree import TargetTree
 from planner_service.tree.cost_grid import CostGrid
 from shared_map.terrain.store import load_prepared, save_prepared
@@ -15,6 +14,7 @@ from shared_map.terrain.terrain import Terrain, terrain_of_pace
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import Window
 
+COSTS = "cell-costs.npy"
 CONFIG = PlannerConfig(strategy="multi_resolution", k_min=0)
 PACE = random_pace(np.random.default_rng(4), 90, 80, 5.0, 0.1)
 
@@ -29,10 +29,11 @@ def mapped(folder: Path, pace: np.ndarray = PACE) -> Terrain:
 
 def test_a_tree_on_shared_costs_is_the_one_on_its_own_to_the_bit_whatever_is_marked(tmp_path: Path) -> None:
     terrain = mapped(tmp_path)
-    shared = PreparedCosts(tmp_path, terrain, CONFIG)
+    shared = shared_costs(tmp_path, terrain, CONFIG)
+    assert shared is not None
     before = {path.name: path.read_bytes() for path in tmp_path.glob("*.npy")}
     one, other = TargetTree(terrain.grid, CONFIG), TargetTree(terrain.grid, CONFIG)
-    one.share(shared.cell_cost)
+    one.share(shared)
     pace = PACE.copy()
     rng = np.random.default_rng(1)
     target = int(np.flatnonzero(np.isfinite(pace))[50])
@@ -56,41 +57,43 @@ def test_a_tree_on_shared_costs_is_the_one_on_its_own_to_the_bit_whatever_is_mar
     assert {path.name: path.read_bytes() for path in tmp_path.glob("*.npy")} == before
 
 
+def test_planners_of_a_machine_share_one_file(tmp_path: Path) -> None:
+    terrain = mapped(tmp_path)
+    one = np.asarray(shared_costs(tmp_path, terrain, CONFIG))
+    assert not one.flags.writeable
+    file = (tmp_path / COSTS).stat().st_ino
+    np.testing.assert_array_equal(one, shared_costs(tmp_path, terrain, CONFIG))
+    assert (tmp_path / COSTS).stat().st_ino == file
+
+
 def test_costs_of_another_terrain_are_never_taken(tmp_path: Path) -> None:
-    PreparedCosts(tmp_path, mapped(tmp_path), CONFIG)
+    shared_costs(tmp_path, mapped(tmp_path), CONFIG)
     pace = PACE.copy()
     pace[3, 3] *= 2
-    other = PreparedCosts(tmp_path, mapped(tmp_path, pace), CONFIG)
+    other = shared_costs(tmp_path, mapped(tmp_path, pace), CONFIG)
     ground = CostGrid(terrain_of_pace(pace, 10.0).grid, CONFIG)
     ground.load(pace)
-    np.testing.assert_array_equal(other.cell_cost, ground.cell_cost)
+    np.testing.assert_array_equal(other, ground.cell_cost)
 
 
-@pytest.mark.parametrize("damage", ["cut", "a bit", "empty", "another array"])
-def test_damaged_files_are_computed_again_and_that_is_said(tmp_path, caplog, damage):
-    """Kernels check no index that they read from them."""
+@pytest.mark.parametrize("damage", ["cut", "a bit", "empty", "no array"])
+def test_damaged_files_are_written_again(tmp_path: Path, damage: str) -> None:
     terrain = mapped(tmp_path)
-    good = PreparedCosts(tmp_path, terrain, CONFIG)
-    expected = good.cell_cost.copy()
-    for path in tmp_path.glob("cell-costs*.npy"):
-        whole = path.read_bytes()
-        path.unlink()
-        match damage:
-            case "cut":
-                path.write_bytes(whole[:-100])
-            case "a bit":
-                path.write_bytes(whole[:-100] + bytes([whole[-100] ^ 4]) + whole[-99:])
-            case "empty":
-                path.write_bytes(b"")
-            case "another array":
-                np.save(path, np.float32(3))
-    with caplog.at_level(logging.WARNING):
-        again = PreparedCosts(tmp_path, terrain, CONFIG)
-    assert "is damaged" in caplog.text
-    np.testing.assert_array_equal(again.cell_cost, expected)
+    shared_costs(tmp_path, terrain, CONFIG)
+    path = tmp_path / COSTS
+    whole, expected = path.read_bytes(), np.load(path)
+    damaged = {
+        "cut": whole[:-100],
+        "a bit": whole[:-1000] + bytes([whole[-1000] ^ 4]) + whole[-999:],
+        "empty": b"",
+        "no array": b"costs",
+    }
+    path.write_bytes(damaged[damage])
+    np.testing.assert_array_equal(shared_costs(tmp_path, terrain, CONFIG), expected)
+    assert path.read_bytes() == whole
 
 
 def test_without_a_folder_that_can_be_written_a_planner_computes_its_own(tmp_path: Path) -> None:
     terrain = mapped(tmp_path)
-    assert prepared_costs(None, terrain, CONFIG) is None
-    assert prepared_costs(tmp_path / "missing", terrain, CONFIG) is None
+    assert shared_costs(None, terrain, CONFIG) is None
+    assert shared_costs(tmp_path / "missing", terrain, CONFIG) is None
