@@ -29,9 +29,10 @@ def test_rows_of_a_docstring_are_items_of_a_list_with_all_their_lines():
 
 
 BUILD = """
-import sys
+import logging, sys
 from mkdocs.commands.build import build
 from mkdocs.config import load_config
+logging.basicConfig(level=logging.WARNING)
 config = load_config("mkdocs.yml", strict=True, site_dir=sys.argv[1])
 options = config.plugins["mkdocstrings"].config.handlers["python"]["options"]
 options |= {"members": False} if sys.argv[2] == "brief" else {}
