@@ -46,7 +46,7 @@ def digests_to(swarm: SwarmModel, source: str, to: str, since: int) -> int:
     return sum(1 for _, sender, taker, topic, _ in heard if (sender, taker, topic) == (source, to, "digest"))
 
 
-@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.seeds(6)
 def test_every_set_reaches_all_who_hold_its_region_under_loss_restarts_and_moves(seed: int) -> None:
     chance = random.Random(seed)
     links = LossyLinks(seed, dropped=0.4, repeated=0.1, jitter_ms=300)

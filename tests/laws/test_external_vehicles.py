@@ -142,7 +142,7 @@ RULES: dict[rules.Broken, int] = {
     a_robot_that_is_replaced_says_that_it_has_ended: 3,
     a_robot_drives_on_though_it_is_replaced: 11,
     a_cell_that_was_shut_for_a_external_is_anybodys: 1,
-    rules.forgets_those_before_in_earlier_generations: 29,
+    rules.forgets_those_before_in_earlier_generations: 72,
     rules.frees_what_the_host_did_not_know_of: 0,
     rules.forgets_where_bodies_are: 3,
     says_of_each_generation_before_that_it_has_ended: 1,

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from support import slow_twins as naive
+from support.effort import few
 from support.kernel_oracle import WALLS, loaded
 from support.planner_strategies import RULES, random_climb, random_pace
 
@@ -107,7 +108,7 @@ def test_lives_of_goals_on_a_map_that_changes_are_answered_as_by_dijkstra(kind: 
     answered = dict.fromkeys(
         ("ok", "no_target", "unreachable", "lethal_goal", "lethal_start", "outside", "kept"), 0
     )
-    for n in range(150 if kind == "narrow" else 25):
+    for n in range(few(450 if kind == "narrow" else 75)):
         rules, ratio = RULES[n % 5], {"narrow": (1.3, 6.0, 300.0)[n % 3], "wide": 1e5, "directed": 5.0}[kind]
         pace = random_pace(rng, *rng.integers(4, 34, 2), ratio, WALLS[n % 4])
         climb = random_climb(rng, GridSpec(*pace.shape, 1.0), 0.3, 0.9) if kind == "directed" else None

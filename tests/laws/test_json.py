@@ -154,10 +154,10 @@ def test_any_values_in_any_fields_raise_nothing_but_protocol_errors(data):
         assert isinstance(read(json.dumps(fields), type(message)), type(message))
 
 
-def test_twenty_thousand_mutations_of_json_raise_nothing_but_protocol_errors():
+def test_mutations_of_json_raise_nothing_but_protocol_errors():
     rng = random.Random(4)
     accepted = 0
-    for n in range(20_000):
+    for n in range(few(20_000)):
         message = EXAMPLES[n % len(EXAMPLES)]
         text = bytearray(encode_json(message))
         for _ in range(rng.choice((1, 1, 2, 5))):
@@ -170,7 +170,7 @@ def test_twenty_thousand_mutations_of_json_raise_nothing_but_protocol_errors():
             accepted += 1
         except ProtocolError:
             pass
-    assert 0 < accepted < 10_000
+    assert 0 < accepted < few(20_000) // 2
 
 
 def test_a_reply_has_one_format_beside_messagepack() -> None:

@@ -96,15 +96,15 @@ def _the_long_way(payload: bytes, kind: type[Message]) -> Message:
     return msgspec.convert(fields, kind, builtin_types=(bytes,))
 
 
-def test_a_hundred_thousand_mutations_raise_nothing_but_protocol_errors():
+def test_mutations_raise_nothing_but_protocol_errors():
     rng = random.Random(1)
     payloads = {kind: encode(example) for kind, example in BY_TYPE.items()}
     everything = list(payloads.values())
     accepted = 0
-    for n in range(100_000):
+    for n in range(few(100_000)):
         kind = TYPES[n % len(TYPES)]
         accepted += _attempt(mutated(payloads[kind], rng, everything), kind)
-    assert 0 < accepted < 50_000
+    assert 0 < accepted < few(100_000) // 2
 
 
 @settings(max_examples=few(300), deadline=None)

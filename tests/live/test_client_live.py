@@ -13,7 +13,6 @@ import signal
 import struct
 import subprocess
 import sys
-import threading
 import time
 from itertools import pairwise
 from pathlib import Path
@@ -24,7 +23,7 @@ from support.live_swarm import swarm as command
 from support.processes import eventually
 
 from swarm.bus.zenoh_bus import open_bus
-from swarm.client import BusError, ConfigError, Route, Swarm, SwarmError, connect
+from swarm.client import BusError, ConfigError, Swarm, SwarmError, connect
 from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec, walk
 from swarm.right_of_way.external_session import ExternalSession
@@ -131,25 +130,6 @@ def test_a_tracker_with_zenoh_alone_owns_its_target_until_it_is_dead(live: LiveS
     eventually(lambda: lost in command(*route).stdout, 20, "that the planner says so")
 
 
-def test_a_live_vehicle_hears_routes_by_callbacks_and_streams_and_what_is_wrong_in_sentences(swarm: Swarm) -> None:
-    told: list[Route] = []
-    with swarm.vehicle("caller", radius_m=3.0) as caller:
-        with pytest.raises(ConfigError, match="outside the terrain"):
-            caller.at(-1e6, 0.0)
-        caller.at(*swarm.frame.centre_m(swarm.frame.grid.cell(40, 60)))
-        caller.on_route(told.append)
-        routes = caller.follow("t1")
-        eventually(lambda: len(told) >= 3, 20, "routes to a target that moves")
-        assert routes.next(1.0) is told[0]
-        with pytest.raises(BusError, match="no route to 'nobody'"):
-            caller.route("nobody", timeout_s=0.5)
-        assert swarm.counts["refused"] == 1
-        ended = threading.Event()
-        reader = threading.Thread(target=lambda: ([None for _ in routes], ended.set()), daemon=True)
-        reader.start()
-    assert ended.wait(2.0), "leaving ends the stream"
-
-
 def test_no_one_in_the_namespace_and_no_router_are_bus_errors(live: LiveSwarm) -> None:
     with pytest.raises(BusError, match="no process of a swarm answers in namespace 'nobody' at tcp/"):
         connect(live.endpoint, namespace="nobody", timeout_s=1.0)
@@ -198,23 +178,6 @@ def test_a_vehicle_with_right_of_way_reserves_its_way_and_is_let_in_cell_by_cell
         other.at(*swarm.frame.centre_m(5))
         with pytest.raises(ConfigError, match="has no right of way: make it with"):
             other.may_enter(5)
-
-
-def test_orders_of_a_program_are_obeyed_and_taken_back(swarm: Swarm) -> None:
-    orders = swarm.orders()
-    assert not orders.pause().silent
-    assert [order.subject for order in orders.given()] == ["pause"]
-    assert not orders.resume().silent
-    x_m, y_m = swarm.frame.centre_m(swarm.frame.grid.cell(80, 110))
-    corners = [(x_m, y_m), (x_m + 90, y_m), (x_m + 90, y_m - 90), (x_m, y_m - 90)]
-    name, acknowledged = orders.add_zone(corners, name="works", for_s=600.0)
-    assert (name, acknowledged.silent) == ("works", [])
-    with swarm.observer() as watching:
-        eventually(lambda: sum(mark.lethal for mark in watching.marks.values()) >= 4, 5, "the zone in the map")
-    assert [zone.name for zone in orders.zones()] == ["works"]
-    assert not orders.remove_zone("works").silent
-    with pytest.raises(ConfigError, match="the order is not possible"):
-        orders.add_zone(corners[:2])
 
 
 # --- vehicles that are not in the scenario: a program's own, and those that `swarm order vehicle add` drives ---

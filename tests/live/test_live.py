@@ -193,16 +193,6 @@ def test_a_second_swarm_in_the_namespace_is_refused_and_the_first_goes_on(live: 
     assert not live.said("starts again")
 
 
-def test_another_terrain_in_the_namespace_is_refused(live: LiveSwarm, tmp_path: Path) -> None:
-    other = tmp_path / "other.toml"
-    text = live.path.read_text().replace("relief_m = 300", "relief_m = 310").replace("count = 2", "count = 3")
-    other.write_text(text)
-    told = swarm("role", "planner", "--target", "t2", other, "--connect", live.endpoint, "--runs", tmp_path)
-    assert told.returncode == 5, told.stderr
-    assert "terrain files or cost rules differ" in told.stderr
-    assert "Traceback" not in told.stderr
-
-
 def test_a_planner_killed_with_9_serves_routes_again_within_3_s(live: LiveSwarm, bus: ZenohBus) -> None:
     row, col = served_cell(bus)
     before = incarnation(bus, row, col)

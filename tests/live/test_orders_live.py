@@ -195,18 +195,9 @@ def test_a_hundred_targets_of_a_stranger_start_nothing(live: LiveSwarm, session:
     assert [name for name in processes(live.run_dir) if name.startswith(("planner-z", "planner-f"))] == []
 
 
-@pytest.mark.parametrize(
-    ("words", "says"),
-    [
-        (("zone", "add", "--polygon", "0,0 5,5 0,5 5,0"), "cross"),
-        (("set", "seed", "4"), "cannot change while the swarm runs"),
-        (("set", "time_scale", "-3"), "-3.0 is not in 0.001 ... 1000"),
-        (("vehicle", "send", "a0-01", "cell:5,5"), "needs planner.places = true"),
-    ],
-)
-def test_a_bad_order_gets_a_sentence(live: LiveSwarm, words: tuple[str, ...], says: str) -> None:
-    error = order(live, *words, code=2)
-    assert says in error
+def test_a_bad_order_gets_a_sentence(live: LiveSwarm) -> None:
+    error = order(live, "vehicle", "send", "a0-01", "cell:5,5", code=2)
+    assert "needs planner.places = true" in error
     assert error.count("\n") == 1
     assert "Traceback" not in error
 

@@ -39,9 +39,14 @@ def port() -> Iterator[int]:
         yield port
 
 
-@pytest.fixture
-def gateway(live: LiveSwarm, port: int, tmp_path: Path) -> Iterator[Gateway]:
-    with Gateway(live.endpoint, f"tcp/127.0.0.1:{port}", tmp_path, "--runs", live.runs) as gateway:
+def beside(live: LiveSwarm, port: int, folder: Path) -> Gateway:
+    return Gateway(live.endpoint, f"tcp/127.0.0.1:{port}", folder, "--runs", live.runs)
+
+
+@pytest.fixture(scope="module")
+def gateway(live: LiveSwarm, port: int, tmp_path_factory: pytest.TempPathFactory) -> Iterator[Gateway]:
+    """One for all tests down to that which kills it."""
+    with beside(live, port, tmp_path_factory.mktemp("gateway")) as gateway:
         yield gateway
 
 
@@ -114,10 +119,11 @@ def test_after_kill_9_of_the_gateway_nothing_of_it_is_left(gateway: Gateway, ses
     node.close()
 
 
-def test_the_gateway_ends_at_ctrl_c_and_says_what_it_lacks(gateway: Gateway, live: LiveSwarm) -> None:
-    gateway.process.send_signal(2)
-    assert gateway.process.wait(40) == 0, gateway.text
-    assert "Traceback" not in gateway.text
+def test_the_gateway_ends_at_ctrl_c_and_says_what_it_lacks(live: LiveSwarm, port: int, tmp_path: Path) -> None:
+    with beside(live, port, tmp_path) as gateway:
+        gateway.process.send_signal(2)
+        assert gateway.process.wait(40) == 0, gateway.text
+        assert "Traceback" not in gateway.text
     alone = subprocess.run(
         [*SWARM, "gateway", "ros2", "--connect", live.endpoint, "--ros", "tcp/127.0.0.1:9"],
         capture_output=True, text=True, timeout=60, check=False,

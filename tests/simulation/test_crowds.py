@@ -12,7 +12,7 @@ from launch_scripts.simulation.simulate import Simulation
 from swarm.config.scenario import TlsConfig
 from swarm.wire.messages.vehicles import VehicleState
 
-SECONDS = 24.0
+SECONDS = 20.0
 
 
 def flows(scenario, terrain, plan):
@@ -26,7 +26,7 @@ def flows(scenario, terrain, plan):
     "kind", [kind if kind == "maze" else pytest.param(kind, marks=pytest.mark.thorough) for kind in CROWDS]
 )
 def test_eight_agents_in_a_crowd_with_every_fault_at_once(kind):
-    scenario, terrain = crowd(kind, 1, vehicles=56, per_agent=7, side=22)
+    scenario, terrain = crowd(kind, 1, vehicles=40, per_agent=5, side=19)
     plan = random_plan(scenario, 1, SECONDS)
     assert plan.crashes and plan.partitions and plan.hangs  # noqa: PT018
     flows(scenario, terrain, plan)
@@ -34,7 +34,7 @@ def test_eight_agents_in_a_crowd_with_every_fault_at_once(kind):
 
 @pytest.mark.seeds(1)
 def test_a_crowd_with_certificates_and_every_fault_flows(seed):
-    scenario, terrain = crowd("open", seed, vehicles=30, per_agent=5, side=16)
+    scenario, terrain = crowd("open", seed, vehicles=20, per_agent=5, side=13)
     tls = TlsConfig(ca="ca.pem", certificate="certs", key="certs")
     scenario = replace(scenario, network=replace(scenario.network, tls=tls))
     flows(scenario, terrain, random_plan(scenario, seed, SECONDS))

@@ -74,7 +74,8 @@ def test_every_vehicle_gets_to_its_place_despite_any_crash(seed: int, terrain: T
 def test_vehicles_chase_again_once_they_have_been_where_they_were_sent(terrain: Terrain) -> None:
     simulation = OrderedSimulation(scenario(1), terrain=terrain)
     simulation.run_until(4.0)
-    first, second = open_cells(terrain, 1, 2)
+    here, grid = vehicles(simulation)["a0-00"].cell, terrain.grid
+    first, second, *_ = sorted(open_cells(terrain, 1, 40), key=lambda cell: grid.distance_cells(here, cell))
     simulation.give(sent(terrain, "a0-00", first, second, then="chase"))
     simulation.run_until(5.0)
     assert vehicles(simulation)["a0-00"].target not in ("t0", "t1")

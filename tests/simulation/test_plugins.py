@@ -3,8 +3,8 @@
 import io
 import re
 from collections.abc import Iterator
+from itertools import zip_longest
 from pathlib import Path
-from typing import Any
 
 import pytest
 from support.plugin_modules import forgotten_afterwards
@@ -111,22 +111,11 @@ Sensor = Walk = Assigner = Dynamics = Plugin
 """
 
 
-def failed(tmp_path: Path, scenario: str, **bodies: str) -> tuple[list[str], dict[str, Any]]:
-    """The messages and the report of a run whose plug-in fails this way after a while."""
-    text = FAILING
-    for name in ("sensor", "walk", "assigned", "speed"):
-        text = text.replace(f"{{{name}}}", bodies.get(name, "None"))
-    (tmp_path / "failing.py").write_text(text)
-    (tmp_path / "scenario.toml").write_text(f"time_scale = 5.0{SMALL}\n{scenario}")
-    simulation, notes = run(tmp_path / "scenario.toml")
-    return notes, simulation.report(SECONDS)
-
-
 SETTINGS = {
-    "sensor": "[vehicles]\nsensor = 'failing:Sensor'",
-    "walk": "[[targets]]\nname = 'a'\nwalk = 'failing:Walk'\n[[targets]]\nname = 'b'\nwalk = 'waypoints'",
-    "assigned": "[vehicles]\nreassign_s = 1.0\nassignment = 'failing:Assigner'",
-    "speed": "[vehicles]\ndynamics = 'failing:Dynamics'",
+    "sensor": "vehicles.sensor = 'failing:Sensor'",
+    "walk": "targets = [{ name = 'a', walk = 'failing:Walk' }, { name = 'b', walk = 'waypoints' }]",
+    "assigned": "vehicles.reassign_s = 1.0\nvehicles.assignment = 'failing:Assigner'",
+    "speed": "vehicles.dynamics = 'failing:Dynamics'",
 }
 NAMED = {
     "sensor": "agent a0: sensor plug-in 'failing:Sensor' of vehicles.sensor: look r",
@@ -147,12 +136,30 @@ WRONG = {
 }  # fmt: skip
 
 
-@pytest.mark.parametrize(("kind", "answer"), [(kind, answer) for kind, wrong in WRONG.items() for answer in wrong])
-def test_a_plugin_that_fails_is_named_once_and_the_swarm_goes_on(kind: str, answer: str, tmp_path: Path) -> None:
-    (note,), report = failed(tmp_path, SETTINGS[kind], **{kind: answer})
-    assert note.startswith(NAMED[kind])
+CASES = [
+    {kind: answer for kind, answer in ((one, first), (other, second)) if answer}
+    for one, other in (("sensor", "assigned"), ("walk", "speed"))
+    for first, second in zip_longest(WRONG[one], WRONG[other])
+]
+
+
+@pytest.mark.parametrize("wrong", CASES, ids=lambda wrong: "-".join(wrong.values()))
+def test_plugins_that_fail_are_named_once_each_and_the_swarm_goes_on(wrong: dict[str, str], tmp_path: Path) -> None:
+    """They answer in this way after a while."""
+    text = FAILING
+    for name in SETTINGS:
+        text = text.replace(f"{{{name}}}", wrong.get(name, "None"))
+    (tmp_path / "failing.py").write_text(text)
+    settings = "\n".join(SETTINGS[kind] for kind in wrong)
+    (tmp_path / "scenario.toml").write_text(f"time_scale = 5.0\n{settings}{SMALL}")
+    simulation, notes = run(tmp_path / "scenario.toml", 6.0)
+    assert sorted(NAMED[kind] for kind in wrong) == sorted(
+        named for note in notes for named in NAMED.values() if note.startswith(named)
+    )
+    assert len(notes) == len(wrong)
+    report = simulation.report(6.0)
     assert report["collisions"] == report["lethal_entries"] == 0
-    assert kind == "speed" or report["vehicles_routed"] == 4
+    assert "speed" in wrong or report["vehicles_routed"] == 4
 
 
 WILD = """

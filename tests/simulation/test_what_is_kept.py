@@ -31,7 +31,7 @@ def simulation_of(name: str, seed: int, trace: io.StringIO | None = None, slower
     or around targets that stay where they were caught."""
     kind, _, others = name.partition(" ")
     of_kind = {"small": SMALL, "wide": WIDE}.get(kind)
-    scenario, terrain = (seeded(seed, of_kind), None) if of_kind else crowd(kind, seed, 40, 10, side=16)
+    scenario, terrain = (seeded(seed, of_kind), None) if of_kind else crowd(kind, seed, 24, 6, side=13)
     if others == "parked":
         targets = tuple(msgspec.structs.replace(target, caught="stay") for target in scenario.targets)
         scenario = msgspec.structs.replace(scenario, targets=targets)

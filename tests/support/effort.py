@@ -9,7 +9,7 @@ from typing import Any
 
 import pytest
 
-COMMIT_SHARE = 0.3
+COMMIT_SHARE = 0.2
 
 _share = COMMIT_SHARE
 

@@ -410,9 +410,9 @@ def test_tracks_forget_every_second_sampling_instead_of_growing() -> None:
 
 def test_a_run_of_a_day_takes_no_more_memory_than_one_of_an_hour(monkeypatch: pytest.MonkeyPatch) -> None:
     """The size of a recorder by its own lists: captures, samples and places are all bounded."""
-    monkeypatch.setattr("launch_scripts.observe.recorder._CAPTURES_KEPT", 512)
-    monkeypatch.setattr("launch_scripts.observe.recorder._MOST_SAMPLES", 512)
-    monkeypatch.setattr("launch_scripts.observe.recorder._MOST_PLACES", 2000)
+    monkeypatch.setattr("launch_scripts.observe.recorder._CAPTURES_KEPT", 128)
+    monkeypatch.setattr("launch_scripts.observe.recorder._MOST_SAMPLES", 128)
+    monkeypatch.setattr("launch_scripts.observe.recorder._MOST_PLACES", 500)
     recorder = Recorder(scenario(), GRID)
 
     def record(from_s: int, until_s: int) -> int:
@@ -422,8 +422,8 @@ def test_a_run_of_a_day_takes_no_more_memory_than_one_of_an_hour(monkeypatch: py
         kept = [recorder.samples, recorder.vehicle_tracks, recorder.target_tracks]
         return len(pickle.dumps([recorder.captures, *(each.kept for each in kept)]))
 
-    hour = record(0, 1500)
-    day = record(1500, 6000)
+    hour = record(0, 400)
+    day = record(400, 1600)
     assert day < 1.5 * hour
     assert len(recorder.captures) == recorder.captures.maxlen
 

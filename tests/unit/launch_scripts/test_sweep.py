@@ -115,7 +115,7 @@ def test_each_study_of_the_project_can_be_read_and_each_of_its_variants_runs(nam
     planned = {each.label: each for each in plan(study, path.parent, name)}
     assert study.outcomes
     for each in planned.values():
-        briefly = msgspec.structs.replace(each.trials[0], seconds=8.0 if study.faults else 1.0)
+        briefly = msgspec.structs.replace(each.trials[0], seconds=8.0 if study.faults else 0.3)
         result = run_trial(briefly)
         assert not result.broken or study.faults  # the quiet at the end of so short a run may be too short
         told = [outcome for outcome in study.outcomes if outcome in result.figures]

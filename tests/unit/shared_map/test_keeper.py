@@ -27,16 +27,6 @@ def some_sets(count: int = 5) -> list[MarkSet]:
     return [set_of("a", tile, 1, {tile: (LETHAL, 0, 10 + tile)}) for tile in range(count)]
 
 
-def test_what_was_saved_is_there_again(tmp_path: Path) -> None:
-    path = tmp_path / "deep" / "map.sqlite"
-    with KeeperStore(path) as store:
-        store.bind("t", GRID)
-        store.save(some_sets())
-    with KeeperStore(path) as store:
-        assert (store.terrain, store.grid) == ("t", GRID)
-        assert list(store.load()) == some_sets()
-
-
 def test_an_older_set_never_replaces_a_newer_one_in_the_store() -> None:
     store = KeeperStore(":memory:")
     store.save([set_of("a", 0, 5, {}, epoch=2)])

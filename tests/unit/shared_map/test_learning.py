@@ -5,17 +5,16 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from msgspec.structs import replace
-from support.map_strategies import retract
 
 from shared_map.cost_map import CostMap
-from shared_map.learned_factors import FACTORS, MOST_STEPS, factors_of, log_steps
+from shared_map.learned_factors import MOST_STEPS, factors_of, log_steps
 from shared_map.pace_measurements import MOST, MOST_CELLS, ONE, Measured, Measurement, TrimmedMean, measurements_in
 from shared_map.replication.replica import MapReplica
 from shared_map.replication.tiles import beyond_tile
 from shared_map.terrain.terrain import Terrain, terrain_of_pace
 from swarm.clock import NS_PER_S
 from swarm.config.vehicle_classes import MOST_CLASSES
-from swarm.wire.messages.map_data import MarkKind, MarkSet
+from swarm.wire.messages.map_data import MarkSet
 
 SAID = st.builds(
     Measurement, st.integers(1, MOST_CELLS), st.integers(-MOST, MOST), st.integers(0, MOST * MOST // ONE)
@@ -96,26 +95,6 @@ def test_factors_lie_within_a_quarter_and_four(said: dict[int, Measurement]) -> 
     factors = factors_of([said])
     assert (factors >= 0.25).all()
     assert (factors <= 4).all()
-
-
-def test_what_is_learned_changes_the_prior_but_neither_marks_nor_lethal_cells() -> None:
-    replica, cost_map = replica_of("all.a.1", GROUND)
-    replica.write([700, 701, 702], [MarkKind.PACE, MarkKind.LETHAL, MarkKind.CLEAR], 0.5, 1)
-    cost_map.take_dirty()
-    replica.write_learned({0: THRICE}, 2)
-    flat = cost_map.pace_s_per_m.reshape(-1)
-    learned = np.float32(0.5) * FACTORS[MOST_STEPS + log_steps([THRICE])]
-    assert flat[700] == 0.5
-    assert flat[701] == np.inf
-    assert flat[702] == learned == flat[0]
-    assert 1.4 < learned < 1.6
-    assert (np.isinf(flat) == np.isinf(GROUND.pace_s_per_m.reshape(-1)) | (np.arange(flat.size) == 701)).all()
-    assert cost_map.take_dirty() == [GROUND.grid.window]
-    retract(replica, [700, 701], 3)
-    assert flat[700] == flat[701] == learned
-    replica.write_learned({}, 4)
-    let_settle(replica)
-    assert (cost_map.pace_s_per_m == GROUND.pace_s_per_m).all()
 
 
 def test_what_is_no_word_changes_nothing() -> None:

@@ -8,20 +8,12 @@ from hypothesis import strategies as st
 from support.map_strategies import GRID, mark_sets, set_of
 
 from shared_map.replication import merge as merge_module
-from shared_map.replication.marks import NO_STATEMENT, HybridClock, dense, fault, supersedes, zone_author
+from shared_map.replication.marks import NO_STATEMENT, HybridClock, dense, fault, zone_author
 from shared_map.replication.merge import TileChange, new_winners, winners
 from shared_map.replication.tiles import grid_cells, region_tiles, tile_cells, tile_corners
 from swarm.wire.messages.map_data import STAMP_LIMIT_NS, MarkKind, MarkSet
 
 PACE, LETHAL, CLEAR = MarkKind.PACE, MarkKind.LETHAL, MarkKind.CLEAR
-
-
-def test_the_set_with_the_higher_epoch_and_then_seq_stays() -> None:
-    old = set_of("a", 0, 9, {}, epoch=1)
-    assert supersedes(set_of("a", 0, 0, {}, epoch=2), old)
-    assert supersedes(set_of("a", 0, 10, {}, epoch=1), old)
-    assert not supersedes(set_of("a", 0, 8, {}, epoch=1), old)
-    assert not supersedes(old, old)
 
 
 @given(st.integers(0, GRID.cells - 1))

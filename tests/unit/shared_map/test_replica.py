@@ -87,14 +87,6 @@ def test_of_a_cell_named_twice_the_last_statement_counts() -> None:
     assert (composite.kinds[5], composite.paces[5]) == (PACE, 3.0)
 
 
-def test_clear_undoes_an_older_lethal_of_someone_whose_clock_is_ahead() -> None:
-    replica, composite = writer()
-    replica.merge([set_of("zz", 0, 0, {5: (LETHAL, 0, NOW + 3600 * NS_PER_S)})])
-    replica.write([5], [CLEAR], [0], NOW)
-    assert composite.kinds[5] == CLEAR
-    assert replica.winners(0).stamps_ns.tolist() == [NOW + 3600 * NS_PER_S + 1]
-
-
 def test_a_mark_taken_back_leaves_what_others_say() -> None:
     replica, composite = writer()
     replica.merge([set_of("other", 0, 0, {5: (PACE, 4.0, 1)})])

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from decimal import Decimal
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
@@ -64,19 +65,36 @@ def test_what_cannot_be_meant_is_refused_without_a_network(name: str, odd: Any) 
 @pytest.mark.parametrize("odd", ODD, ids=range(len(ODD)))
 def test_what_cannot_be_meant_is_refused_by_a_client(odd: Any) -> None:
     program = Program(Swarm(rough(3, lethal=0.0))).swarm
-    rover = program.vehicle("rover")
-    rover.at(*program.frame.centre_m(CLIENT_GRID.cell(5, 5)))
-    orders = program.orders()
+    frame, rover, orders = program.frame, program.vehicle("rover"), program.orders()
+    x_m, y_m = frame.centre_m(CLIENT_GRID.cell(5, 5))
+    rover.at(x_m, y_m)
+    rover.give_way(Mock(stands=lambda cell: True, counted=lambda cell, x_m, y_m: cell))
     calls: dict[str, Callable[[], Any]] = {
         "id": lambda: program.vehicle(odd),
+        "id of target": lambda: program.target(odd),
         "group": lambda: program.vehicle("other", group=odd),
-        "vehicle_class": lambda: program.route_soon("t", 5.0, -5.0, vehicle_class=odd),
-        "x_m": lambda: rover.at(odd, -5.0),
-        "speed_m_per_s": lambda: rover.at(5.0, -5.0, speed_m_per_s=odd),
+        "radius_m": lambda: program.vehicle("other", radius_m=odd),
+        "lease_s": lambda: program.vehicle("other", lease_s=odd),
+        "lease_s of target": lambda: program.target("other", lease_s=odd),
+        "vehicle_class": lambda: program.route_soon("t", x_m, y_m, vehicle_class=odd),
+        "timeout_s": lambda: program.route_soon("t", x_m, y_m, timeout_s=odd),
+        "timeout_s of route": lambda: program.route((x_m, y_m), (x_m, y_m), timeout_s=odd),
+        "timeout_s of rover": lambda: rover.route_soon("t", odd),
+        "every_s": lambda: program.observer(every_s=odd),
+        "x_m": lambda: rover.at(odd, y_m),
+        "y_m": lambda: rover.at(x_m, odd),
+        "x_m of cell": lambda: frame.cell(odd, y_m),
+        "speed_m_per_s": lambda: rover.at(x_m, y_m, speed_m_per_s=odd),
         "cell": lambda: rover.mark([odd], lethal=True),
+        "cell of frame": lambda: frame.centre_m(odd),
+        "cell to write": lambda: frame.written(odd),
+        "cell to enter": lambda: rover.may_enter(odd),
+        "cell to reserve": lambda: rover.reserve([odd]),
+        "places": lambda: orders.send("v0", odd),
         "lethal": lambda: rover.mark([5], lethal=odd, clear=odd),
+        "pace_s_per_m": lambda: rover.mark([5], pace_s_per_m=odd),
         "target": lambda: rover.follow(odd),
-        "start_m": lambda: program.route(odd, (5.0, -5.0), timeout_s=0.0),
+        "start_m": lambda: program.route(odd, (x_m, y_m), timeout_s=0.0),
         "polygon_m": lambda: orders.add_zone(odd),
         "lat_deg": lambda: Frame(GridSpec(3, 3, 1.0, crs="EPSG:4326")).from_wgs84(odd, 1.0),
     }
@@ -84,15 +102,24 @@ def test_what_cannot_be_meant_is_refused_by_a_client(odd: Any) -> None:
         with pytest.raises(ConfigError) as caught:
             call()
         assert "\n" not in str(caught.value)
-        assert name.split("_")[0] in str(caught.value) or name == "target", (name, str(caught.value))
+        named = name.split("_")[0].split()[0]
+        elsewhere = name in ("target", "pace_s_per_m")
+        assert named in str(caught.value) or elsewhere, (name, str(caught.value))
 
 
-def test_a_list_of_cells_is_no_text_and_no_number() -> None:
+def test_a_list_is_no_text_and_no_number_and_a_number_is_no_text() -> None:
     program = Program(Swarm(rough(3, lethal=0.0))).swarm
     rover = program.vehicle("rover")
     for cells in (5, "55", b"55", np.int64(5), np.array(5)):
         with pytest.raises(ConfigError, match=r"cells is .*, expected a list"):
             rover.mark(cells, lethal=True)  # type: ignore[arg-type]
+    with pytest.raises(ConfigError, match=r"the order is not possible: .*, expected a list"):
+        program.orders().chase("all", "t0")
+    for wrong in (True, "7", None, np.nan):
+        with pytest.raises(ConfigError, match="radius_m is"):
+            program.frame.cells_within(5.0, -5.0, wrong)  # type: ignore[arg-type]
+        with pytest.raises(ConfigError, match="the place is"):
+            program.frame.cell_named((wrong, 3))  # type: ignore[arg-type]
 
 
 @pytest.mark.parametrize("number", NUMBERS, ids=lambda number: number.dtype.char)
@@ -101,6 +128,8 @@ def test_numbers_of_numpy_are_numbers(number: Any, tmp_path: Path) -> None:
     terrain = TerrainConfig(source=str(tmp_path / "a.npz"), water_below_m=number)
     assert build_terrain(Scenario(terrain=terrain)).grid.rows == 20
     assert RouteFinder(np.ones((3, 3)), (0, 0), resolution_m=number).route(0, 1).cost_s == 3
+    assert Frame(GRID).cell_named((number, 1)) == GRID.cell(3, 1)
+    assert Frame(GRID).centre_m(GRID.cell(3, 1)) == GRID.centre_m(GRID.cell(3, 1))
 
 
 def test_a_wrong_keyword_is_told_the_nearest() -> None:

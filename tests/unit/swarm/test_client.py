@@ -113,11 +113,9 @@ def test_a_place_outside_or_no_number_is_refused_counted_and_loses_nothing(world
 
 @pytest.mark.parametrize(
     ("kind", "name", "wrong"),
-    [("vehicle", "id", "a b"), ("vehicle", "id", "a0-01"), ("vehicle", "id", 5), ("vehicle", "id", []),
-     ("vehicle", "group", "x/y"), ("vehicle", "radius_m", -1.0), ("vehicle", "radius_m", math.nan),
-     ("vehicle", "radius_m", "5"), ("vehicle", "radius_m", 100.1), ("vehicle", "lease_s", 0.0),
-     ("vehicle", "lease_s", 1e9), ("vehicle", "lease_s", None), ("target", "id", "a b"),
-     ("target", "tracker", "a/b"), ("target", "lease_s", 0.0), ("target", "lease_s", math.nan)],
+    [("vehicle", "id", "a0-01"), ("vehicle", "group", "x/y"), ("vehicle", "radius_m", -1.0),
+     ("vehicle", "radius_m", 100.1), ("vehicle", "lease_s", 0.0), ("vehicle", "lease_s", 1e9),
+     ("target", "tracker", "a/b"), ("target", "lease_s", 0.0)],
 )  # fmt: skip
 def test_a_vehicle_or_target_that_cannot_be_is_refused_in_a_sentence(kind, name, wrong, program: Program) -> None:
     with pytest.raises(ConfigError, match=name):
@@ -125,55 +123,22 @@ def test_a_vehicle_or_target_that_cannot_be_is_refused_in_a_sentence(kind, name,
     assert program.swarm.counts["refused"] == 1
 
 
-HALF, TRUTH, TEXT = 2.5, True, "7"
-
-
-@pytest.mark.parametrize("wrong", [HALF, TRUTH, np.bool_(True), TEXT, None, -1, GRID.cells, math.nan])
-def test_what_is_no_cell_is_refused_by_every_call_that_takes_one(world: Swarm, wrong: Any) -> None:
-    program = Program(world).swarm
-    rover = program.vehicle("rover")
-    rover.at(*program.frame.centre_m(GRID.cell(5, 5)))
-    rover.give_way(NeverAsked())  # type: ignore[arg-type]
-    for call in (
-        lambda: program.frame.centre_m(wrong),
-        lambda: program.frame.written(wrong),
-        lambda: rover.may_enter(wrong),
-        lambda: rover.reserve([wrong]),
-        lambda: rover.mark([wrong], lethal=True),
-    ):
-        with pytest.raises(ConfigError, match=r"^cell .*(expected a whole number|outside the terrain)"):
-            call()
-    with pytest.raises(ConfigError):
-        program.frame.cell_named((wrong, 3))
-    assert program.frame.cell_named((np.int16(1), 2.0)) == GRID.cell(1, 2)  # type: ignore[arg-type]
-    assert program.frame.centre_m(np.int16(7)) == program.frame.centre_m(7)  # type: ignore[arg-type]
-
-
-class NeverAsked:
-    """Right of way which takes nothing, as nothing wrong reaches it."""
-
-    may_enter = want = None
-
-    def stands(self, cell: int) -> bool:
-        return True
-
-    def counted(self, cell: int, x_m: float, y_m: float) -> int:
-        return cell
-
-
-class OnAStep(NeverAsked):
+class OnAStep:
     """Right of way of a vehicle in a cell beside the diagonal step from (5, 5) to (6, 6)."""
 
     wanted: Sequence[int] = ()
     cells = GRID.cell(5, 5), GRID.cell(6, 6)
 
+    def stands(self, cell: int) -> bool:
+        return True
+
     def counted(self, cell: int, x_m: float, y_m: float) -> int:
         return self.cells[0]
 
-    def want(self, path: Sequence[int]) -> None:  # type: ignore[override]
+    def want(self, path: Sequence[int]) -> None:
         self.wanted = path
 
-    def may_enter(self, cell: int, timeout_s: float) -> bool:  # type: ignore[override]
+    def may_enter(self, cell: int, timeout_s: float) -> bool:
         return True
 
 
@@ -186,36 +151,6 @@ def test_who_clips_a_cell_beside_a_diagonal_step_keeps_the_cell_that_it_drives_i
     for asked in ([beside, *ahead], [way.cells[0], *ahead], ahead):  # a route begins at `rover.cell`
         assert rover.reserve(asked) == [way.cells[1]]
         assert way.wanted == [way.cells[0], *ahead]
-
-
-@pytest.mark.parametrize("wrong", [TRUTH, np.bool_(False), TEXT, b"7", None, [1.0, 2.0], math.nan])
-def test_what_is_no_number_is_refused_by_every_call_that_takes_one(world: Swarm, wrong: Any) -> None:
-    program = Program(world).swarm
-    frame, rover = program.frame, program.vehicle("rover")
-    x_m, y_m = frame.centre_m(GRID.cell(5, 5))
-    rover.at(x_m, y_m)
-    for call in (
-        lambda: frame.cell(wrong, y_m),
-        lambda: frame.cells_within(x_m, y_m, wrong),
-        lambda: frame.from_wgs84(wrong, 9.0),
-        lambda: rover.at(x_m, wrong),
-        lambda: rover.at(x_m, y_m, speed_m_per_s=wrong),
-        lambda: rover.route_soon("t", wrong),
-        lambda: program.route_soon("t", x_m, y_m, timeout_s=wrong),
-        lambda: program.route((x_m, y_m), (x_m, y_m), timeout_s=wrong),
-        lambda: program.observer(every_s=wrong),
-        lambda: program.target("new", lease_s=wrong),
-        lambda: rover.mark([7], pace_s_per_m=wrong) if wrong is not None else rover.mark([7]),
-    ):
-        with pytest.raises(ConfigError):
-            call()
-
-
-def test_one_text_is_no_list_of_texts(world: Swarm) -> None:
-    orders = Program(world).swarm.orders()
-    for call in (lambda: orders.send("v0", "cell:1,2"), lambda: orders.chase("all", "t0")):
-        with pytest.raises(ConfigError, match=r"the order is not possible: .*, expected a list"):
-            call()
 
 
 def test_one_program_has_each_vehicle_and_target_once_at_a_time(program: Program) -> None:
@@ -242,8 +177,8 @@ def test_what_is_made_takes_part_once_it_is_whole_as_ticks_come_on_another_threa
 
 def test_wrong_headings_and_speeds_are_refused_by_the_rules_of_the_wire(rover: Vehicle) -> None:
     for wrong in (
-        {"heading_rad": 99.0}, {"heading_rad": "N"}, {"speed_m_per_s": -1.0}, {"speed_m_per_s": math.nan},
-        {"speed_m_per_s": 341.0}, {"x_m": "5"}, {"x_m": None}, {"y_m": 10**400},
+        {"heading_rad": 99.0}, {"heading_rad": "N"}, {"speed_m_per_s": -1.0}, {"speed_m_per_s": 341.0},
+        {"y_m": 10**400},
     ):  # fmt: skip
         with pytest.raises(ConfigError, match=next(iter(wrong))):
             rover.at(**({"x_m": 5.0, "y_m": -5.0} | wrong))
@@ -431,13 +366,10 @@ def test_most_processes_say_which_run_it_is_and_what_time() -> None:
         ({}, "states one thing"),
         ({"lethal": True, "clear": True}, "states one thing"),
         ({"pace_s_per_m": 0.0}, "pace_s_per_m is 0.0"),
-        ({"pace_s_per_m": math.nan}, "pace_s_per_m is nan"),
         ({"lethal": True, "for_s": -1.0}, "for_s is -1.0"),
         ({"lethal": True, "cells": [3, 10**9]}, "cell 1000000000 is outside"),
         ({"lethal": True, "cells": [-1]}, "cell -1 is outside"),
         ({"lethal": True, "cells": [3.5]}, "cell is 3.5, expected a whole number"),
-        ({"lethal": True, "cells": "x"}, "cells is 'x', expected a list"),
-        ({"pace_s_per_m": "quick"}, "pace_s_per_m is 'quick', expected a number"),
     ],
 )
 def test_a_wrong_mark_is_refused_whole(world, wrong, complaint, program, rover):

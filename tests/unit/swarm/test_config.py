@@ -5,11 +5,21 @@ from pathlib import Path
 from typing import get_args, get_type_hints
 
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from swarm.config.explain import meanings
 from swarm.config.scenario import Scenario, crew_of, ids_of, plan_agents
-from swarm.config.scenario_files import load_scenario, parse_scenario, read_scenario
+from swarm.config.scenario_files import (
+    flat,
+    load_scenario,
+    parse_scenario,
+    read_scenario,
+    scenario_text,
+    with_settings,
+)
 from swarm.config.setting_types import Section
+from swarm.config.vehicle_classes import cost_of_preset, of_class
 from swarm.errors import ConfigError
 
 
@@ -165,3 +175,94 @@ def test_no_pattern_of_a_setting_lets_a_line_end_through() -> None:
     ends = re.compile(r"""pattern=r?["'][^\n]*\$["']""")
     found = [str(path) for path in sources if ends.search(path.read_text("utf-8"))]
     assert (found, len(sources) > 300) == ([], True)
+
+
+# --- classes of vehicles: what each inherits, and the sentence for each fault ------------------------------
+
+_TWO = """
+cost = { slope_rule = "table", slope_table = [[-30, 2.0], [0, 1.0], [30, 4.0]], max_slope_deg = 25.0 }
+[[classes]]
+name = "walker"
+max_speed_m_per_s = 0.5
+cost = { preset = "hiker", class_factor = { rock = 1.25 } }
+[[classes]]
+name = "same"
+"""
+
+
+def test_a_class_is_what_it_says_over_its_preset_over_the_common_cost_or_the_scenario_itself() -> None:
+    scenario = parse_scenario(_TWO)
+    walker = of_class(scenario, "walker")
+    assert (walker.cost.slope_rule, walker.cost.max_slope_deg, walker.cost.slope_table) == ("tobler", 40.0, ())
+    speeds = walker.cost.flat_speed_m_per_s, walker.cost.road_speed_m_per_s, walker.cost.top_speed_m_per_s
+    assert speeds == (0.5, 0.5, 0.5)
+    assert walker.cost.class_factor == {"rock": 1.25}
+    assert of_class(scenario, "ground") is scenario
+    assert of_class(scenario, "same") == scenario
+    assert parse_scenario("").classes == ()
+    with pytest.raises(ConfigError, match=r"has no class 'boat'.*ground"):
+        of_class(Scenario(), "boat")
+
+
+def test_a_written_scenario_has_the_same_classes(tmp_path: Path) -> None:
+    (tmp_path / "scenario.toml").write_text(_TWO)
+    scenario = load_scenario(tmp_path / "scenario.toml")
+    (tmp_path / "again.toml").write_text(scenario_text(scenario, tmp_path))
+    assert load_scenario(tmp_path / "again.toml") == scenario
+
+
+def test_classes_keep_the_preset_of_the_common_cost() -> None:
+    scenario = parse_scenario(
+        'cost = { preset = "wheeled" }\nclasses = [{ name = "slow", cost = { vehicle_radius_m = 1 } }]'
+    )
+    cost = of_class(scenario, "slow").cost
+    assert cost.max_slope_deg == cost_of_preset("wheeled").max_slope_deg
+    assert cost.vehicle_radius_m == 1
+
+
+# --- settings by dotted keys: their changes, and the answer to a key that leads nowhere --------------------
+
+_TABLES = st.recursive(
+    st.integers() | st.text(max_size=3) | st.lists(st.integers(), max_size=2),
+    lambda inner: st.dictionaries(st.text("abc", min_size=1, max_size=2), inner, min_size=1, max_size=3),
+    max_leaves=8,
+)
+
+
+@given(st.dictionaries(st.text("abc", min_size=1, max_size=2), _TABLES, max_size=3))
+def test_what_is_set_key_by_key_into_nothing_is_the_table_itself(table):
+    assert with_settings({}, dict(flat(table)), "x") == table
+
+
+def test_a_setting_takes_the_place_of_what_the_file_says_and_the_file_stays_as_it_was():
+    raw = {"groups": [{"vehicles": 2}, {"vehicles": 3}], "map": {"learning": True}}
+    changed = with_settings(raw, {"groups.*.vehicles": 7, "groups.1.name": "b", "map.digest_s": 2.0}, "x")
+    assert changed == {
+        "groups": [{"vehicles": 7}, {"vehicles": 7, "name": "b"}],
+        "map": {"learning": True, "digest_s": 2.0},
+    }
+    assert raw == {"groups": [{"vehicles": 2}, {"vehicles": 3}], "map": {"learning": True}}
+
+
+@pytest.mark.parametrize(
+    ("key", "said"),
+    [
+        ("groups.2.vehicles", "x: groups.2.vehicles: found '2' in a list, expected a number from 0 to 0 or '*'"),
+        ("groups.vehicles", "found 'vehicles' in a list"),
+        ("groups.-1.vehicles", "found '-1' in a list"),
+        ("name.first", "x: name.first: found 'n' above 'first', expected a table"),
+        ("empty.0", "expected nothing, as it is empty, or '*'"),
+        (".".join("a" * 17), "a key has more than 16 parts"),
+        (".".join("a" * 5000), "a key has more than 16 parts"),
+    ],
+)
+def test_a_key_that_leads_nowhere_is_refused_with_what_was_found(key, said):
+    with pytest.raises(ConfigError) as error:
+        with_settings({"groups": [{"vehicles": 1}], "name": "n", "empty": []}, {key: 1}, "x")
+    assert said in str(error.value)
+
+
+def test_a_preset_as_a_setting_brings_its_own_settings():
+    text = '[cost]\npreset = "hiker"'
+    wheeled = parse_scenario(text, settings={"cost.preset": "wheeled"})
+    assert wheeled.cost == parse_scenario('[cost]\npreset = "wheeled"').cost

@@ -80,12 +80,6 @@ def test_the_union_of_windows_is_the_smallest_cover_in_any_order_and_those_that_
         assert not all(within) or (a.touches(b) and b.touches(a))
 
 
-def test_row_zero_is_north():
-    grid = GridSpec(10, 20, 30.0, west_m=1000.0, north_m=5000.0)
-    assert grid.centre_m(0) == (1015.0, 4985.0)
-    assert grid.centre_m(20) == (1015.0, 4955.0)
-
-
 @pytest.mark.parametrize("wrong", [-1, 6, 10**12])
 def test_a_cell_outside_the_grid_is_a_bug_that_raises(wrong):
     grid = GridSpec(2, 3, 1.0)

@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from support.effort import few
 from support.traffic_world import Disk, Faults, Process, TrafficWorld
 
 import swarm.right_of_way.shards
@@ -71,7 +72,7 @@ def test_vehicles_of_agents_with_shards_of_two_sizes_do_not_meet(
     agents: int, per_agent: int, side: int, others: set[str], other_side: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(swarm.right_of_way.shards, "REGION_CELLS", 4)
-    for seed in range(4):
+    for seed in range(few(4)):
         world = Mixed(seed, agents, per_agent, side, others, other_side)
         world.run(12)
         assert world.collisions == [], seed

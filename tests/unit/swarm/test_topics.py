@@ -1,4 +1,4 @@
-"""Key expressions: a composed key comes apart again, and only a composed one."""
+"""Key expressions: a composed key comes apart again, and only a composed one. Ids, of which they are made."""
 
 import itertools
 import subprocess
@@ -10,6 +10,7 @@ from hypothesis import strategies as st
 
 from swarm.errors import ProtocolError
 from swarm.peers import Peer
+from swarm.wire import fields
 from swarm.wire.topics import FLEET, KNOWN, MARKS, POSE, TOPICS, peer_of
 
 chunks = st.text("abzAZ09_.-", min_size=1, max_size=12)
@@ -19,12 +20,12 @@ topics = st.sampled_from(TOPICS)
 @given(st.data(), topics, chunks)
 def test_a_key_parses_back_to_its_fields_and_those_not_given_are_wildcards(data, topic, namespace):
     given_fields = data.draw(st.sets(st.sampled_from(topic.fields)) | st.just(set(topic.fields)))
-    fields = {name: data.draw(chunks) for name in topic.fields if name in given_fields}
-    expression = topic.expression(namespace, **fields)
-    assert topic.parse(namespace, expression) == {name: fields.get(name, "*") for name in topic.fields}
-    assert expression.count("*") == len(topic.fields) - len(fields)
-    if len(fields) == len(topic.fields):
-        assert topic.keyed(namespace, **fields) == expression
+    drawn = {name: data.draw(chunks) for name in topic.fields if name in given_fields}
+    expression = topic.expression(namespace, **drawn)
+    assert topic.parse(namespace, expression) == {name: drawn.get(name, "*") for name in topic.fields}
+    assert expression.count("*") == len(topic.fields) - len(drawn)
+    if len(drawn) == len(topic.fields):
+        assert topic.keyed(namespace, **drawn) == expression
 
 
 def test_no_key_belongs_to_two_topics():
@@ -40,13 +41,13 @@ def test_names_are_unique_and_every_topic_is_published_or_served():
 
 @given(st.data(), topics)
 def test_a_key_that_is_remembered_is_the_one_that_would_be_made(data, topic):
-    fields = {name: data.draw(chunks | st.integers(0, 9)) for name in topic.fields}
-    named = {name: str(value) for name, value in fields.items()}
-    backwards = dict(reversed(fields.items()))
-    for given_fields in (fields, fields, backwards, named):
+    drawn = {name: data.draw(chunks | st.integers(0, 9)) for name in topic.fields}
+    named = {name: str(value) for name, value in drawn.items()}
+    backwards = dict(reversed(drawn.items()))
+    for given_fields in (drawn, drawn, backwards, named):
         assert topic.value(given_fields) == (named, topic.key.format(**named))
     with pytest.raises(TypeError, match="has no field colour"):
-        topic.value(fields | {"colour": "red"})
+        topic.value(drawn | {"colour": "red"})
 
 
 def test_no_sender_of_ever_other_keys_makes_more_of_them_remembered_than_there_is_room_for(monkeypatch):
@@ -54,6 +55,16 @@ def test_no_sender_of_ever_other_keys_makes_more_of_them_remembered_than_there_i
     for n in range(9):
         assert POSE.keyed("swarm", target=f"new{n}") == f"swarm/target/new{n}/pose"
         assert len(POSE._values) <= 3
+
+
+def test_a_sender_of_ever_new_ids_makes_no_process_know_more_than_there_is_room_for(monkeypatch):
+    monkeypatch.setattr(fields, "_MAX_KNOWN_IDS", 10)
+    monkeypatch.setattr(fields, "_KNOWN_IDS", set())
+    for n in range(100):
+        fields.check_id("vehicle", f"v{n}")
+        with pytest.raises(ValueError, match="is not 1 to 64 of letters"):
+            fields.check_id("vehicle", f"v/{n}")
+        assert len(fields._KNOWN_IDS) <= 10
 
 
 @pytest.mark.parametrize("wrong", ["", "a/b", "a*", "$*", "**", "a b", "a?b", "a#", "\n"])

@@ -14,6 +14,7 @@ from support.shard_tables import granted_cells, holdings_of
 
 from shared_map.terrain.terrain import terrain_of_pace
 from shared_map.vehicle_class_grounds import class_grounds
+from swarm.clock import NS_PER_S
 from swarm.config.scenario import Scenario, plan_agents
 from swarm.config.scenario_files import parse_scenario
 from swarm.grid import GridSpec
@@ -25,7 +26,7 @@ from vehicle_agent.agent_maps import LocalMap
 from vehicle_agent.driving.driven_vehicle import Places, Vehicle
 from vehicle_agent.position_reports import FleetReport
 from vehicle_agent.sensing.sensor import TruthSensor
-from vehicle_agent.start_cells import spawn_cells
+from vehicle_agent.start_cells import Spawning, spawn_cells
 from vehicle_agent.target_choice import AskCosts, choose, have_answered
 
 GRID = GridSpec(12, 12, 10.0)
@@ -251,3 +252,53 @@ def test_a_region_that_the_vehicles_have_left_is_told_so_once() -> None:
     assert [told[0].ids, told[1].ids] == [["u"], []]
     assert told[0].seq == told[1].seq == 2
     assert list(dict(report.reports(Places(grid, [near]), 3 * S))) == [0]
+
+
+# --- vehicles of an added agent enter the map on free cells: no obstacle, and no zone -----------------------------
+
+
+class Held:
+    """Holdings of which leaders grant nothing by themselves."""
+
+    def __init__(self) -> None:
+        self.generation, self.replaced = 1, False
+        self.asked: list[tuple[str, int]] = []
+        self.paths: dict[str, list[int]] = {}
+
+    def path(self, vehicle: str) -> list[int]:
+        return self.paths.get(vehicle, [])
+
+    def enter(self, vehicle: str, cell: int) -> None:
+        self.asked.append((vehicle, cell))
+
+
+def entering(closed: set[int], at_s: float = 2.0) -> tuple[Spawning, Held]:
+    held = Held()
+    made = Spawning(["v"], [1, 2, 3], held, lambda cell: cell not in closed)  # type: ignore[arg-type]
+    made.tick(False, 0)
+    made.tick(True, int(at_s * NS_PER_S))
+    return made, held
+
+
+def test_closed_cells_are_not_asked_for() -> None:
+    closed = {1, 2, 3}
+    made, held = entering(closed)
+    assert held.asked == []
+    closed.remove(2)
+    made.tick(True, 3 * NS_PER_S)
+    assert held.asked == [("v", 2)]
+
+
+def test_a_cell_that_is_closed_while_it_is_asked_for_is_not_taken_and_another_is_asked_for_at_once() -> None:
+    closed: set[int] = set()
+    made, held = entering(closed)
+    closed.add(1)
+    assert not made.may_stand("v", 1)
+    made.tick(True, 2 * NS_PER_S + 1)
+    assert held.asked == [("v", 1), ("v", 2)]
+    assert made.may_stand("v", 2)
+
+
+def test_who_is_found_where_an_earlier_generation_left_it_stands_there_whatever_closes_the_cell() -> None:
+    made, _ = entering({7}, at_s=0.0)
+    assert made.may_stand("v", 7)

@@ -79,7 +79,7 @@ def test_in_a_crowded_maze_no_one_is_stuck_for_long(seed: int) -> None:
     world.start_all()
     stands_since: dict[str, tuple[tuple[int, int], int]] = {}
     longest_s = captures = 0
-    for second in range(100):
+    for second in range(60):
         world.run(1.0)
         for target in world.scenario.target_ids:
             if any(v.target == target and v.in_reach for v in world.vehicles()):
@@ -89,6 +89,6 @@ def test_in_a_crowded_maze_no_one_is_stuck_for_long(seed: int) -> None:
             if id not in stands_since or stands_since[id][0] != place:
                 stands_since[id] = (place, second)
             longest_s = max(longest_s, second - stands_since[id][1])
-    assert captures > 30
-    assert longest_s < 50
+    assert captures > 18
+    assert longest_s < 30
     world.assert_lawful()
