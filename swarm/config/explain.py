@@ -237,7 +237,8 @@ def plain(given: Any) -> Any:
 def _plain(value: Any) -> Any:
     if isinstance(value, os.PathLike):
         return os.fspath(value)
-    found: Any = value.tolist() if hasattr(value, "tolist") else [type(value).__name__]
+    # No field is a list of lists of texts: a value that has no form in a file is refused where it stands.
+    found: Any = value.tolist() if hasattr(value, "tolist") else [[type(value).__name__]]
     return float(found) if type(found) is type(value) else found  # of more bits than Python's
 
 

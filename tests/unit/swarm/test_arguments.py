@@ -113,8 +113,10 @@ def test_a_list_is_no_text_and_no_number_and_a_number_is_no_text() -> None:
     for cells in (5, "55", b"55", np.int64(5), np.array(5)):
         with pytest.raises(ConfigError, match=r"cells is .*, expected a list"):
             rover.mark(cells, lethal=True)  # type: ignore[arg-type]
-    with pytest.raises(ConfigError, match=r"the order is not possible: .*, expected a list"):
-        program.orders().chase("all", "t0")
+    wrong_targets: list[Any] = ["t0", object(), 1j, len, np.ones((2, 2)), [object()], {"t0": 1}]
+    for targets in wrong_targets:
+        with pytest.raises(ConfigError, match=r"the order is not possible: targets.* expected"):
+            program.orders().chase("all", targets)
     for wrong in (True, "7", None, np.nan):
         with pytest.raises(ConfigError, match="radius_m is"):
             program.frame.cells_within(5.0, -5.0, wrong)  # type: ignore[arg-type]
