@@ -2,13 +2,19 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
+import re
+import socket
 import subprocess
+import threading
+import urllib.request
 from pathlib import Path
 
 import pytest
-from support.live_swarm import SWARM, folders_of_runs
-from support.processes import eventually, in_session
+from support.live_swarm import SMALL_WORLD, SWARM, folders_of_runs
+from support.monitor_rig import taking
+from support.processes import Child, eventually, in_session
 
 from launch_scripts.report.report_and_tracks import TRACKS_FILE, read_tracks
 
@@ -42,3 +48,61 @@ def test_a_short_demo_ends_well_and_its_report_says_so(tmp_path: Path) -> None:
         assert (run_dir / f"{log}.log").stat().st_size > 0, log
     for name in ("run.rrd", "report.png"):
         assert (run_dir / name).stat().st_size > 0, name
+
+
+SHORT_DEMO = f"""
+name = "short"
+seconds = 12
+{SMALL_WORLD}
+[monitor]
+web_port = 0
+"""
+"""A scenario that ends by itself later than `up` takes a viewer for one that has left."""
+STAYS = "until the live view is closed"
+
+
+def open_stream(port: int) -> socket.socket | None:
+    """The stream of a live view, as its page holds it; None while only the start page is there."""
+    with contextlib.suppress(OSError):
+        urllib.request.urlopen(f"http://127.0.0.1:{port}/run.json", timeout=10).close()  # as the page does
+        stream = socket.create_connection(("127.0.0.1", port), timeout=10)
+        stream.sendall(taking())
+        with contextlib.suppress(OSError):
+            if b" 200 " in stream.recv(13):
+                return stream
+        stream.close()
+    return None
+
+
+def read_all(stream: socket.socket) -> None:
+    with contextlib.suppress(OSError):
+        while stream.recv(1 << 16):
+            pass
+
+
+def test_the_demo_goes_on_while_a_viewer_is_connected_and_ends_by_itself_after_it(tmp_path: Path) -> None:
+    (tmp_path / "demo").write_text(SHORT_DEMO)  # a file in the working directory precedes the built-in scenario
+    command = [*SWARM, "demo", "--port", "0", "--plain"]
+    with Child(tmp_path / "output.txt", *command, cwd=tmp_path, start_new_session=True) as demo:
+        demo.wait_for(r"open http://127\.0\.0\.1:\d+", 60)
+        streams: list[socket.socket] = []
+
+        def connected() -> bool:
+            (*_, port) = re.findall(r"open http://127\.0\.0\.1:(\d+)", demo.text)
+            streams.extend(filter(None, [open_stream(int(port))]))
+            return bool(streams)
+
+        eventually(connected, 90, "the stream of the live view", every_s=0.5)
+        with streams[0] as stream:
+            reader = threading.Thread(target=read_all, args=(stream,), daemon=True)
+            reader.start()
+            demo.wait_for("all processes are alive", 90)
+            # A line comes each 5 s: the fourth is later than the 10 s for which a page may be loaded again.
+            eventually(lambda: demo.text.count(STAYS) >= 4 or demo.process.poll() is not None, 90, STAYS)
+            assert demo.process.poll() is None, demo.text
+            stream.shutdown(socket.SHUT_RDWR)
+        reader.join(30)
+        eventually(lambda: demo.process.poll() is not None, 120, "the end of the demo without a viewer")
+        assert demo.process.returncode == 0, demo.text
+        eventually(lambda: not in_session(demo.process.pid), 5, "the end of all")
+    assert len(folders_of_runs(tmp_path / "runs")) == 1
