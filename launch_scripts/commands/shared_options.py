@@ -61,7 +61,7 @@ ScenarioArgument = Annotated[
 Namespace = Annotated[
     str | None, from_environment("SWARM_NAMESPACE", help="Prefix of all keys: runs in different ones do not meet.")
 ]
-Runs = Annotated[Path, from_environment("SWARM_RUNS", help="Folder of the runs of this machine.")]
+Runs = Annotated[Path, from_environment("SWARM_RUNS", help="Folder that holds a folder for each run.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON on standard output, all else on standard error.")]
 PortOption = Annotated[
     int | None,

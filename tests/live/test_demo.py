@@ -7,8 +7,6 @@ import json
 import re
 import socket
 import subprocess
-import threading
-import urllib.request
 from pathlib import Path
 
 import pytest
@@ -16,6 +14,7 @@ from support.live_swarm import SMALL_WORLD, SWARM, folders_of_runs
 from support.monitor_rig import taking
 from support.processes import Child, eventually, in_session
 
+from launch_scripts.observe.run_folders import registry
 from launch_scripts.report.report_and_tracks import TRACKS_FILE, read_tracks
 
 pytestmark = [pytest.mark.network, pytest.mark.slow]
@@ -58,51 +57,39 @@ seconds = 12
 web_port = 0
 """
 """A scenario that ends by itself later than `up` takes a viewer for one that has left."""
+PAGE = r"open http://127\.0\.0\.1:(\d+)"
 STAYS = "until the live view is closed"
 
 
-def open_stream(port: int) -> socket.socket | None:
-    """The stream of a live view, as its page holds it; None while only the start page is there."""
+def open_stream(port: int) -> list[socket.socket]:
+    """The stream of a live view, as its page holds it; none while only the start page is there."""
     with contextlib.suppress(OSError):
-        urllib.request.urlopen(f"http://127.0.0.1:{port}/run.json", timeout=10).close()  # as the page does
-        stream = socket.create_connection(("127.0.0.1", port), timeout=10)
+        stream = socket.create_connection(("127.0.0.1", port), timeout=30)
         stream.sendall(taking())
-        with contextlib.suppress(OSError):
-            if b" 200 " in stream.recv(13):
-                return stream
+        if b" 200 " in stream.recv(13):
+            return [stream]
         stream.close()
-    return None
+    return []
 
 
-def read_all(stream: socket.socket) -> None:
-    with contextlib.suppress(OSError):
-        while stream.recv(1 << 16):
-            pass
-
-
-def test_the_demo_goes_on_while_a_viewer_is_connected_and_ends_by_itself_after_it(tmp_path: Path) -> None:
+def test_the_demo_goes_on_while_a_viewer_is_connected_and_ends_by_itself_after_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("SWARM_STATE", str(tmp_path / "state"))
     (tmp_path / "demo").write_text(SHORT_DEMO)  # a file in the working directory precedes the built-in scenario
     command = [*SWARM, "demo", "--port", "0", "--plain"]
     with Child(tmp_path / "output.txt", *command, cwd=tmp_path, start_new_session=True) as demo:
-        demo.wait_for(r"open http://127\.0\.0\.1:\d+", 60)
+        demo.wait_for(PAGE)
         streams: list[socket.socket] = []
-
-        def connected() -> bool:
-            (*_, port) = re.findall(r"open http://127\.0\.0\.1:(\d+)", demo.text)
-            streams.extend(filter(None, [open_stream(int(port))]))
-            return bool(streams)
-
-        eventually(connected, 90, "the stream of the live view", every_s=0.5)
+        eventually(
+            lambda: streams.extend(open_stream(int(re.findall(PAGE, demo.text)[-1]))) or streams, 90, "a stream"
+        )
         with streams[0] as stream:
-            reader = threading.Thread(target=read_all, args=(stream,), daemon=True)
-            reader.start()
-            demo.wait_for("all processes are alive", 90)
             # A line comes each 5 s: the fourth is later than the 10 s for which a page may be loaded again.
-            eventually(lambda: demo.text.count(STAYS) >= 4 or demo.process.poll() is not None, 90, STAYS)
+            eventually(lambda: not stream.recv(1 << 18) or demo.text.count(STAYS) >= 4, 150, STAYS)
             assert demo.process.poll() is None, demo.text
-            stream.shutdown(socket.SHUT_RDWR)
-        reader.join(30)
         eventually(lambda: demo.process.poll() is not None, 120, "the end of the demo without a viewer")
         assert demo.process.returncode == 0, demo.text
         eventually(lambda: not in_session(demo.process.pid), 5, "the end of all")
-    assert len(folders_of_runs(tmp_path / "runs")) == 1
+    (entry,) = registry().glob("*.json")
+    assert json.loads(entry.read_text())["is_ending"], "`swarm ps` says so while the report is written"
