@@ -117,7 +117,7 @@ class RouteLines:
     """
 
     def __init__(self, mesh: TerrainMesh, stride: int) -> None:
-        """stride  number of cells between two points of a line"""
+        """The stride is the number of cells between two points of a line."""
         self._mesh = mesh
         self._stride = stride
         self._drawn = np.zeros(mesh.grid.cells, np.bool_)

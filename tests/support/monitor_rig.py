@@ -69,7 +69,7 @@ class Rig(SwarmModel):
         config: MonitorConfig = SILENT,
         audience: Audience = SOMEBODY,
     ) -> None:
-        """audience  who looks; set `self.audience` for those who come and go"""
+        """The audience is who looks; set `self.audience` for those who come and go."""
         self.audience = audience
         super().__init__(terrain=terrain, scenario=scenario, start_ns=0)
         self.speaker = self.bus("speaker")

@@ -401,7 +401,6 @@ class TrafficWorld:
 
     def ask_known(self, source: Process, first: bool = False) -> None:
         """Asks everybody what they know of us, again and again as long as it is needed."""
-
         own = source.disk.own
         request = KnownRequest(agent=source.agent, disk=own.disk, shard_cells=source.rights.shards.side)
 
