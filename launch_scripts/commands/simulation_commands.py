@@ -62,7 +62,7 @@ def simulate(
     swarm simulate doors --seeds 17:18
 
     scenario  A .toml file or a built-in name; with --seeds also small, wide, open, doors, corridor or maze.
-    seed      Seed of everything random in one run, without faults.
+    seed      Seed of everything random.
     seeds     Try the seeds A to B - 1, each with faults of every kind.
     seconds   Simulated seconds.
     trace     Write the event log here; the same seed writes the same log.
