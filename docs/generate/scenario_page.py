@@ -112,7 +112,7 @@ def _rows(path: str, section: Section) -> Iterator[tuple[str, ...]]:
 
 
 def _meanings(section: Section) -> dict[str, str]:
-    """Returns the meaning of each field. A field of the root that is a section of its own is described by that section."""
+    """Returns the meaning of each field. A section that is a field of the root is described by itself."""
     said = meanings(section)
     for name, hint in hints_of(section).items():
         if name not in said:

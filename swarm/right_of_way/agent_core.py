@@ -17,7 +17,7 @@ from swarm.clock import NS_PER_S
 from swarm.config.scenario import agent_of
 from swarm.errors import StoreError
 from swarm.grid import REGION_CELLS
-from swarm.right_of_way.holdings import Tell, Wish
+from swarm.right_of_way.holdings import CellRequest, Tell
 from swarm.right_of_way.host import GENERATIONS_KEPT, AskKnown, Host
 from swarm.right_of_way.shard_member import Member, MemberAction, Refused, RoundTrips
 from swarm.right_of_way.shards import Shards
@@ -220,7 +220,7 @@ class RightOfWay:
 
     # --- time passes ----------------------------------------------------------------------------------------
 
-    def tick(self, wishes: Mapping[str, Wish], now_ns: int) -> list[Action]:
+    def tick(self, requests: Mapping[str, CellRequest], now_ns: int) -> list[Action]:
         """Returns the messages of our members and our vehicles to send now."""
         actions: list[Action] = [Refused(text) for text in self.host.refused]
         self.host.refused.clear()
@@ -231,7 +231,7 @@ class RightOfWay:
         if self.host.replaced:
             self.host.watch(self._known_of(self.agent, self.own.disk).shards)
         actions += self.host.lefts(now_ns)
-        actions += self.host.standings(wishes, now_ns)
+        actions += self.host.standings(requests, now_ns)
         if self.host.ended_alone(now_ns):
             actions.append(AskKnown())
         return actions

@@ -340,8 +340,8 @@ def seats_a_file_that_is_not_the_first(begin, self, chance):
 
 
 @in_place_of(Holdings, "standings")
-def acts_on_a_table_that_is_not_the_newest(standings, self, wishes, now_ns):
-    said = standings(self, wishes, now_ns)
+def acts_on_a_table_that_is_not_the_newest(standings, self, requests, now_ns):
+    said = standings(self, requests, now_ns)
     for known in (self._views, self._entries.knows, self._entries.over):
         for shard in [shard for shard in known if shard not in self.watched]:
             del known[shard]

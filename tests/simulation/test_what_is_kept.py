@@ -57,13 +57,13 @@ def test_events_are_those_of_agents_that_keep_nothing_and_look_at_all_vehicles(n
     looked, logs, make = [0, 0], [io.StringIO(), io.StringIO()], CellRequests.make
     run = 0
 
-    def make_wishes(wishes: CellRequests, vehicles: list[Vehicle], now_ns: int) -> None:
+    def make_requests(requests: CellRequests, vehicles: list[Vehicle], now_ns: int) -> None:
         looked[run] += len(vehicles)
         if run:
-            wishes.make_anew()
-        make(wishes, vehicles, now_ns)
+            requests.make_anew()
+        make(requests, vehicles, now_ns)
 
-    monkeypatch.setattr(CellRequests, "make", make_wishes)
+    monkeypatch.setattr(CellRequests, "make", make_requests)
     simulation_of(name, seed, logs[0], slower=4.0).run_until(SECONDS)  # several ticks a cell
     monkeypatch.setattr(Vehicle, "needs_nothing", property(lambda vehicle: False))
     run = 1

@@ -15,7 +15,7 @@ from swarm.grid import GridSpec
 from swarm.peers import Peer
 from swarm.right_of_way.agent_core import Action, OwnRecord, RightOfWay
 from swarm.right_of_way.agent_session import OwnTime
-from swarm.right_of_way.holdings import Tell, Wish
+from swarm.right_of_way.holdings import CellRequest, Tell
 from swarm.right_of_way.host import AskKnown
 from swarm.right_of_way.shard_member import AskPromises, Refused, Save
 from swarm.right_of_way.shards import Shards
@@ -177,13 +177,13 @@ class Process:
         holdings = self.rights.host
         self.own_time.tick(self.world.now_ns + self.offset_ns)
         self.see_tokens()
-        wishes = {}
+        requests = {}
         if holdings.generation and not holdings.replaced:
             for vehicle in self.vehicles:
                 if holdings.path(vehicle):
                     self.drive(vehicle)
-                    wishes[vehicle] = self.wish(vehicle)
-        self.perform(self.rights.tick(wishes, self.now_ns))
+                    requests[vehicle] = self.request(vehicle)
+        self.perform(self.rights.tick(requests, self.now_ns))
         if holdings.replaced:
             self.world.ended(self)
 
@@ -216,7 +216,7 @@ class Process:
             self.world.moves[vehicle] = self.world.moves.get(vehicle, 0) + 1
             self.world.look()
 
-    def wish(self, vehicle: str) -> Wish:
+    def request(self, vehicle: str) -> CellRequest:
         world = self.world
         path = holdings_path = self.rights.host.path(vehicle)
         goal = world.goals[vehicle]
@@ -237,7 +237,7 @@ class Process:
         if pushed:
             better = len(wants)
         # In steps, so that a statement of changes leaves out vehicles that wait.
-        return Wish(ahead, wants, better, max(self.ages[vehicle] >> 10 << 10, pushed))
+        return CellRequest(ahead, wants, better, max(self.ages[vehicle] >> 10 << 10, pushed))
 
 
 class TrafficWorld:

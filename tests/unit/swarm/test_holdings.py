@@ -5,7 +5,7 @@ import pytest
 from support.shard_tables import GRID, MEMBERS, SHARDS, S, entries, granted_of, hear, holdings_of, table_of
 
 from swarm.right_of_way.generations import HEARTBEAT_NS
-from swarm.right_of_way.holdings import Holdings, Wish
+from swarm.right_of_way.holdings import CellRequest, Holdings
 from swarm.wire.messages.traffic import Entry, Left
 from swarm.wire.topics import HOST_STATE
 
@@ -41,11 +41,10 @@ def test_an_entry_given_back_is_not_taken_again_and_another_of_the_same_cell_is(
     hear(holdings, table_of(1, 1, a0=[9]))
     hear(holdings, table_of(1, 2, a0=[9, *entries(1, 2, 10, 11)]))
     holdings.give_back("a0-00")
-    (told,) = holdings.standings({"a0-00": Wish(ahead=[10, 11], wants=[10, 17, 1], better=2)}, S)
+    requests = [{"a0-00": CellRequest(ahead=[10, 11], wants=[10, 17, 1], better=2)} for _ in range(2)]
+    (told,) = holdings.standings(requests[0], S)
     said = told.standing
-    assert (
-        holdings.standings({"a0-00": Wish(ahead=[10, 11], wants=[10, 17, 1], better=2)}, S + HEARTBEAT_NS - 1) == []
-    )
+    assert holdings.standings(requests[1], S + HEARTBEAT_NS - 1) == []
     assert ([*said.vehicles[0].holds], said.vehicles[0].ahead) == ([(9, 1, 1)], [10, 11])
     hear(holdings, table_of(1, 3, a0=[9, *entries(1, 2, 10, 11)]))  # it has not heard that yet
     assert list(holdings.path("a0-00")) == [9]
@@ -57,24 +56,24 @@ def test_a_host_gives_back_what_another_waits_for_far_ahead_and_says_so_at_once(
     holdings.keeps = 2
     cells = [8, 9, 10, 11, 12, 13, 14]
     hear(holdings, table_of(1, 1, a0=cells))
-    wish = {"a0-00": Wish()}
-    holdings.standings(wish, S)
+    request = {"a0-00": CellRequest()}
+    holdings.standings(request, S)
     for seq, followed, left in ((2, 10, cells), (3, 13, cells[:5])):
         table = granted_of(table_of(1, seq, a0=cells))
         holdings.hear_granted(msgspec.structs.replace(table, followed={"a1": [(followed, 1, 1)]}), S)
         assert holdings.path("a0-00") == left
     assert [word.entries for word in holdings.lefts(S)] == [[(13, 1, 1)]]
-    (told,) = holdings.standings(wish, S)
+    (told,) = holdings.standings(request, S)
     assert [*told.standing.vehicles[0].holds] == [(cell, 1, 1) for cell in cells[:5]]
 
 
 def test_to_have_driven_on_is_no_news_until_another_waits_or_little_is_left(holdings: Holdings) -> None:
     holdings.keeps = 2
-    cells, wish = [8, 9, 10, 11, 12, 13, 14], {"a0-00": Wish()}
+    cells, request = [8, 9, 10, 11, 12, 13, 14], {"a0-00": CellRequest()}
     hear(holdings, table_of(1, 1, a0=cells))
 
     def held_by_word() -> list[int]:
-        return [cell for told in holdings.standings(wish, S) for cell in told.standing.vehicles[0].holds.cells]
+        return [cell for told in holdings.standings(request, S) for cell in told.standing.vehicles[0].holds.cells]
 
     assert held_by_word() == cells
     holdings.moved("a0-00", 10)

@@ -29,7 +29,7 @@ def test_a_round_of_planning_sends_no_two_to_one_cell_and_lets_the_oldest_throug
         assert to == mover.cell or to in mover.wants
         if to != mover.cell and to in at:
             assert round.to[at[to]] != mover.cell  # no two vehicles exchange places
-    # If any cell is free, the oldest gets its first wish: all others can be pushed along.
+    # If any cell is free, the oldest gets its first choice: all others can be pushed along.
     if movers[0].better and count < GRID.cells // 2:
         assert round.to["v0"] == movers[0].wants[0]
 
