@@ -195,10 +195,10 @@ class RightOfWay:
         for member in self._members.values():
             member.revoke(names, now_ns)
 
-    def hear_host_state(self, standing: HostState, now_ns: int) -> None:
-        member = self._member(standing.shard, now_ns)
+    def hear_host_state(self, state: HostState, now_ns: int) -> None:
+        member = self._member(state.shard, now_ns)
         if member is not None:
-            member.hear_host_state(standing, now_ns)
+            member.hear_host_state(state, now_ns)
 
     def hear_table(self, table: Table, now_ns: int) -> list[Action]:
         member = self._member(table.shard, now_ns)
@@ -231,7 +231,7 @@ class RightOfWay:
         if self.host.replaced:
             self.host.watch(self._known_of(self.agent, self.own.disk).shards)
         actions += self.host.lefts(now_ns)
-        actions += self.host.standings(requests, now_ns)
+        actions += self.host.host_states(requests, now_ns)
         if self.host.ended_alone(now_ns):
             actions.append(AskKnown())
         return actions

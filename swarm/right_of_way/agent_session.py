@@ -329,9 +329,9 @@ class RightOfWaySync:
             match action:
                 case AskKnown():
                     self._asked_ns, self._unasked, self._known_tag = None, True, ""  # at the next tick
-                case Tell(members, standing):
+                case Tell(members, state):
                     for member in members:
-                        self.bus.publish(HOST_STATE, standing, shard=standing.shard, member=member, agent=self._id)
+                        self.bus.publish(HOST_STATE, state, shard=state.shard, member=member, agent=self._id)
                 case traffic.Left():
                     self.bus.publish(LEFT, action, host=action.host, agent=self._id)
                 case traffic.Granted():

@@ -200,8 +200,8 @@ class ExternalVehicle:
             # Not that it has ended, as a host would: its vehicle still stands there.
             return [AskKnown()] if self.host.ended_alone(now_ns) and self._cell is not None else []
         self._wait(now_ns)
-        standings = self.host.standings({self.vehicle: self._request_now(now_ns)}, now_ns)
-        return [*self.host.lefts(now_ns), *standings]
+        host_states = self.host.host_states({self.vehicle: self._request_now(now_ns)}, now_ns)
+        return [*self.host.lefts(now_ns), *host_states]
 
     def _wait(self, now_ns: int) -> None:
         """Gives back what it waits for in vain, so that no circle of waiting lasts."""
@@ -264,4 +264,4 @@ class Removal:
         self.host.begin_as(self.host.generation, generations)  # which has ended, too: no vehicle drives by it
 
     def tick(self, now_ns: int) -> list[Tell]:
-        return [] if self.host.replaced else self.host.standings({}, now_ns)
+        return [] if self.host.replaced else self.host.host_states({}, now_ns)

@@ -69,7 +69,7 @@ class Tell:
     """Send a host state to these members of its shard."""
 
     members: tuple[str, ...]
-    standing: HostState
+    state: HostState
 
 
 _Told = tuple[Stand, object]
@@ -402,7 +402,7 @@ class Holdings:
 
     # --- what to say ----------------------------------------------------------------------------------------
 
-    def standings(self, requests: Mapping[str, CellRequest], now_ns: int) -> list[Tell]:
+    def host_states(self, requests: Mapping[str, CellRequest], now_ns: int) -> list[Tell]:
         """Returns the statements for each shard that concerns us, if they are new or the last one is a heartbeat
         old. Cells that a statement omits are released."""
         if not self.generation:
@@ -483,7 +483,7 @@ class Holdings:
     def _tell(self, shard: int, stands: list[Stand], now_ns: int) -> Tell:
         """Returns the statement about these, for one leader as changes since one that it has."""
         view, members = self._views[shard], self._listeners(shard, now_ns)
-        standing = HostState(
+        state = HostState(
             shard=shard,
             agent=self.name,
             generation=self.generation,
@@ -496,8 +496,8 @@ class Holdings:
         )
         base = view.sent.get(view.heard) if members == (view.leader,) else None
         if self.shards.reads_changes(self.name):
-            keep_last(view.sent, self._seq, standing, STATES_KEPT)
-        return Tell(members, standing if base is None else standing.changes(base))
+            keep_last(view.sent, self._seq, state, STATES_KEPT)
+        return Tell(members, state if base is None else state.changes(base))
 
     def _listeners(self, shard: int, now_ns: int) -> tuple[str, ...]:
         view = self._views[shard]

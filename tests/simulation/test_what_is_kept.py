@@ -93,9 +93,9 @@ def told_anew(leader: Leader, table: Table, host: str) -> tuple[dict[str, Held],
         earlier = [each for each in before if each[0][0] == number[0] and each[0][1:] < number[1:]]
         return Entry(number, [(n[1], n[2], of) for n, of in earlier if of != vehicle])
 
-    standing, cols = leader._hosts[host].standing, leader._shards.grid.cols
+    state, cols = leader._hosts[host].state, leader._shards.grid.cols
     steps = [south * cols + east for south in (-1, 0, 1) for east in (-1, 0, 1) if south or east]
-    near = {stand.end + step for stand in (standing.vehicles if standing else ()) for step in steps}
+    near = {stand.end + step for stand in (state.vehicles if state else ()) for step in steps}
     held = {number[0] for _, numbers in every for number in numbers}
     own = {number[0] for numbers in ours.values() for number in numbers}
     each = {vehicle: [entry(number, vehicle) for number in numbers] for vehicle, numbers in ours.items()}

@@ -127,11 +127,9 @@ class Process:
                 case AskPromises():
                     for member in action.members:
                         self.world.claim(self, action, member)
-                case Tell(members, standing):
+                case Tell(members, state):
                     for member in members:
-                        self.world.send(
-                            self, member, lambda to, s=standing: to.rights.hear_host_state(s, to.now_ns)
-                        )
+                        self.world.send(self, member, lambda to, s=state: to.rights.hear_host_state(s, to.now_ns))
                 case Table():
                     for member in self.world.shards.members(action.shard):
                         self.world.send(self, member, lambda to, t=action: to.hear_table(t))
