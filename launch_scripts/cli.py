@@ -51,8 +51,8 @@ class Root(TyperGroup):
       terrain ...           Inspect and convert terrain
 
     More (swarm help --all):
-    `swarm COMMAND -h` explains a command. SWARM_CONNECT and other variables
-    stand for options (docs/operate/run.md).
+    `swarm COMMAND -h` explains a command. Variables such as SWARM_CONNECT set
+    options (docs/operate/run.md).
     """
 
     all = False

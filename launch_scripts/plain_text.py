@@ -26,7 +26,7 @@ class Duration:
     seconds: float
 
     def __str__(self) -> str:
-        """86 s, 19 min, 5 h 20 min"""
+        """Returns text such as 86 s, 19 min, 5 h 20 min."""
         left = round(self.seconds)
         if left < _SECONDS_UP_TO:
             return f"{left} s"
@@ -42,18 +42,18 @@ class Moment:
     ns: int
 
     def __str__(self) -> str:
-        """14:22:10, by the clock on this machine's wall"""
+        """Returns text such as 14:22:10, by this machine's local time."""
         return time.strftime("%H:%M:%S", time.localtime(self.ns // NS_PER_S))
 
 
 def number_of(number: int, thing: str) -> str:
-    """no routes, 1 process, 2,345 processes"""
+    """Returns text such as no routes, 1 process, 2,345 processes."""
     plural = "" if number == 1 else "es" if thing.endswith("s") else "s"
     return f"{number:,} {thing}{plural}" if number else f"no {thing}{plural}"
 
 
 def first_of(names: Sequence[str]) -> str:
-    """a0, a1, a2 and 4 more"""
+    """Returns text such as a0, a1, a2 and 4 more."""
     return ", ".join(names[:_NAMED]) + (f" and {len(names) - _NAMED} more" if len(names) > _NAMED else "")
 
 

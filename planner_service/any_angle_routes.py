@@ -86,7 +86,7 @@ class Puller:
     def _returns(
         self, starts: NDArray[np.int64], directions: NDArray[np.uint8], ends: NDArray[np.int64]
     ) -> NDArray[np.bool_]:
-        """bool (n,): which routes come to a cell twice."""
+        """Returns bool (n,): the routes that come to a cell twice."""
         route = np.repeat(np.arange(starts.size), np.diff(ends, prepend=0))
         moved = np.cumsum(self._offsets[directions])
         before = np.concatenate((np.zeros(1, np.int64), moved))[np.concatenate((np.zeros(1, np.int64), ends[:-1]))]

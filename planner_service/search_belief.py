@@ -50,7 +50,7 @@ class Blocks:
 
     @property
     def open(self) -> Bools:
-        """bool (rows, cols): the blocks with a passable cell."""
+        """The blocks with a passable cell, bool (rows, cols)."""
         opened: Bools = self.share > 0.0
         return opened
 
@@ -210,7 +210,7 @@ class Belief:
 
     @property
     def reachable(self) -> Bools:
-        """bool (rows, cols): where the target can be by now."""
+        """Returns bool (rows, cols): where the target can be by now."""
         if self._arrival_s is None:
             return self.blocks.open
         reached: Bools = self.blocks.open & (self._arrival_s <= self.elapsed_s)

@@ -395,7 +395,7 @@ class Searcher:
         return int((rows.start + downs[at]) * blocks.grid.cols + cols.start + rights[at])
 
     def _taken(self, blocks: Blocks, vehicle: str | None) -> Bools:
-        """bool (rows, cols): around the places of other vehicles."""
+        """Returns bool (rows, cols): around the places of other vehicles."""
         taken: Bools = np.zeros(blocks.shape, np.bool_)
         for id, goal in self._goals.items():
             if id != vehicle:

@@ -15,7 +15,7 @@ from shared_map.terrain.slope_and_climb import may_be_pulled
 from swarm.clock import NS_PER_S
 from swarm.config.scenario import AgentPlan, Scenario
 from swarm.grid import Window, walk
-from swarm.right_of_way.holdings import Holdings, Wish
+from swarm.right_of_way.holdings import CellRequest, Holdings
 from swarm.runtime.tracker_ownership import Trackings
 from swarm.wire.messages.orders import GoalState
 from swarm.wire.messages.planning import PlaceRouteReply, PushedRoute, RouteReply, TargetPose
@@ -108,8 +108,8 @@ class Agent:
         self._steering = Steering(grid, pace, scenario.planner, config.reserve_cells, self.obstacles, climb)
         holdings.keeps = config.reserve_cells
         reach_cells = max(config.reserve_cells, FAR_CELLS) + FAR_CELLS
-        near_cells, seed = reach_cells + 2, f"{scenario.seed}/{plan.id}"
-        self._wishes = CellRequests(self._steering, holdings, near_cells, self._target_cell, self._in_reach, seed)
+        near, seed = reach_cells + 2, f"{scenario.seed}/{plan.id}"
+        self._cell_requests = CellRequests(self._steering, holdings, near, self._target_cell, self._in_reach, seed)
         self._pulled = scenario.planner.routes == "pulled" and may_be_pulled(climb)
         self._driver = Driver(
             local_map,
@@ -237,13 +237,13 @@ class Agent:
         for id in vehicles:
             self.holdings.leave(id)
             self.vehicles.pop(id, None)
-            self._wishes.forget(id)
+            self._cell_requests.forget(id)
 
     def stand_down(self) -> None:
         """Stops driving for ever, because another process drives the vehicles."""
         for id in list(self.vehicles):
             del self.vehicles[id]
-            self._wishes.forget(id)
+            self._cell_requests.forget(id)
 
     @property
     def shut_in(self) -> Set[str]:
@@ -260,15 +260,15 @@ class Agent:
         if ways_out == self._steering.ways_out:
             return
         self._steering.ways_out = ways_out
-        self._wishes.make_anew()
+        self._cell_requests.make_anew()
         for vehicle in self.vehicles.values():
             if vehicle.cell in ways_out:  # a step along the way before this one is not allowed any more
                 self._driver.end_path(vehicle)
 
     @property
-    def wishes(self) -> Mapping[str, Wish]:
+    def cell_requests(self) -> Mapping[str, CellRequest]:
         """Requests to leaders for each vehicle, as of the last `decide`."""
-        return self._wishes.of
+        return self._cell_requests.of
 
     @property
     def places(self) -> list[int]:
@@ -314,7 +314,7 @@ class Agent:
         changed    the windows with all cells that have changed
         by_others  others may have changed the map: compare the view with it again
         """
-        self._wishes.ground_changed(changed)
+        self._cell_requests.ground_changed(changed)
         if not changed or not self.vehicles:
             return
         vehicles = list(self.vehicles.values())
@@ -362,13 +362,13 @@ class Agent:
             self._lost = lost
             self.decide_anew()
         driven: list[Vehicle] = []
-        paths, pushed, wishes = self.holdings.paths, self.holdings.pushed, self._wishes
+        paths, pushed, cell_requests = self.holdings.paths, self.holdings.pushed, self._cell_requests
         waiting = self._steering.waiting_ns
-        wishes.look_around(list(self.vehicles.values()))
+        cell_requests.look_around(list(self.vehicles.values()))
         for vehicle in self.vehicles.values():
             path, decided = paths[vehicle.id], vehicle.decided
             same = decided is not None and decided[0] is path and decided[1] == vehicle.route.version
-            if same and vehicle.id not in pushed and wishes.is_kept(vehicle.id, now_ns):
+            if same and vehicle.id not in pushed and cell_requests.is_kept(vehicle.id, now_ns):
                 continue
             if vehicle.tracked == (vehicle.target in lost):
                 vehicle.set_tracked(not vehicle.tracked)
@@ -390,7 +390,7 @@ class Agent:
                 start = path[: self.holdings.keeps + 1][-1]
                 asks.setdefault(key, []).append((vehicle.id, start, reason))
             if stopped:
-                self._wishes.stay(vehicle.id)
+                self._cell_requests.stay(vehicle.id)
                 continue
             driven.append(vehicle)
             if len(path) == 1:
@@ -399,7 +399,7 @@ class Agent:
                 waiting.pop(vehicle.id, None)
                 if not waits and not vehicle.motion.at_rest and vehicle.needs_nothing:
                     vehicle.decided = path, vehicle.route.version
-        wishes.make(driven, now_ns)
+        cell_requests.make(driven, now_ns)
         for (target_id, force), batch in asks.items():
             self._requests += 1
             ids, cells, reasons = zip(*batch, strict=True)

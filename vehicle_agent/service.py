@@ -191,7 +191,7 @@ class AgentService(MemberService):
             self._drive(now_ns)
             self._perform(self.agent.decide(now_ns))
             self._report(Places(self._replica.grid, self.agent.vehicles.values()), now_ns)
-            self._right_of_way.tick(self.agent.wishes, now_ns)
+            self._right_of_way.tick(self.agent.cell_requests, now_ns)
 
     def _report(self, places: Places, now_ns: int) -> None:
         """Publishes where the vehicles are, each time that they have driven: between two reports they are where the
@@ -248,7 +248,7 @@ class AgentService(MemberService):
                 self._bus.publish(topics.SENT, chasers, places=self._places_job, author=self._author)
             else:
                 self._bus.publish(topics.CHASERS, chasers, target=chasers.target, author=self._author)
-        self._right_of_way.tick(agent.wishes, now_ns)
+        self._right_of_way.tick(agent.cell_requests, now_ns)
         self._member.tell_faults(parts.faults, now_ns)
         states = bytes([vehicle.state for vehicle in agent.vehicles.values()])
         for state, name in _GAUGES:
@@ -264,7 +264,7 @@ class AgentService(MemberService):
     def stop(self, now_ns: int) -> None:
         if self._parts.spawning is not None:
             self._on_leave([])  # an orderly end takes its vehicles away; a killed process leaves them
-            self._right_of_way.tick(self.agent.wishes, now_ns)
+            self._right_of_way.tick(self.agent.cell_requests, now_ns)
         self._member.publish_stats(now_ns)
 
     def _collected(self, topic: topics.Topic, kind: type[M]) -> Iterator[M]:

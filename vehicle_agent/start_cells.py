@@ -32,8 +32,8 @@ _TRIES = 64
 def spawn_cells(
     scenario: Scenario, grid: GridSpec, grounds: Mapping[str, ClassGround]
 ) -> dict[str, dict[str, int]]:
-    """agent -> vehicle -> cell, of the whole run. All cells differ, and each lies in the largest connected part
-    which the vehicle's class can drive, except those that the scenario names.
+    """Returns agent -> vehicle -> cell, of the whole run. All cells differ, and each lies in the largest connected
+    part which the vehicle's class can drive, except those that the scenario names.
 
     grounds  of every class that vehicles belong to
 

@@ -2,7 +2,7 @@
 
 python -m docs.generate.method_pictures [NAME ...]
 
-What the paper prints and this project does otherwise comes from `printed`.
+`printed` has the rules of the paper from which this project differs.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ class Chase:
         return np.concatenate([[start], np.array(start) + np.cumsum(moves, axis=0)])
 
     def costs(self) -> NDArray[np.float64]:
-        """(rows, cols), s: what is driven along the route of each cell; inf where there is none."""
+        """Returns (rows, cols), s: the time to drive the route of each cell; inf without a route."""
         return self.tree.routes(np.arange(self.grid.cells)).cost_s.reshape(self.pace.shape)
 
 

@@ -1,4 +1,4 @@
-"""What the paper prints, taken literally, where this project does something else. For docs/method/paper.md only.
+"""The rules of the paper, taken literally, from which this project differs. For docs/method/paper.md only.
 
 Wan, Zhang, Murray, Kaufman: Automatic target tracking on multi-resolution terrain.
 """
@@ -35,7 +35,7 @@ def printed_range(east: int, south: int, k_min: int) -> int:
 
 def lattice_route(pace: Pace, start: Place, target: Place, stride: int) -> NDArray[np.int64]:
     """(n, 2) places of the cheapest route over every `stride`th cell only, as in section 3.3.3 far from the target.
-    Both ends stand on that lattice. What lies between two of its cells is not looked at."""
+    Both ends stand on that lattice. Cells between those of the lattice do not count."""
     parent = _dijkstra(pace, target, stride, lambda here, there: float(pace[here]))[1]
     route = [start]
     while route[-1] != target:

@@ -82,7 +82,7 @@ def schema(root: Section = Scenario) -> str:
 def _number(text: str) -> float:
     """Returns a whole number as such.
 
-    Of two bounds that are equal, 10000 and 1e4, `typing` keeps that of the module which is imported first.
+    If two bounds are equal, such as 10000 and 1e4, `typing` keeps the one which was imported first.
     """
     value = float(text)
     return int(value) if value.is_integer() else value
@@ -112,7 +112,7 @@ def _rows(path: str, section: Section) -> Iterator[tuple[str, ...]]:
 
 
 def _meanings(section: Section) -> dict[str, str]:
-    """What each field means. A field of the root that is a section of its own is described by that section."""
+    """Returns the meaning of each field. A section that is a field of the root is described by itself."""
     said = meanings(section)
     for name, hint in hints_of(section).items():
         if name not in said:
@@ -125,7 +125,7 @@ def _meanings(section: Section) -> dict[str, str]:
 
 
 def _allowed(hint: Any) -> str:
-    """Returns the type and its bounds in words: those of an error, and what is in a list or a table."""
+    """Returns the type and its bounds in the words of an error, with the types inside a list or a table."""
     kind, words = bare(hint), expected(hint)
     for long, short in _SHORT.items():
         words = words.replace(long, short)

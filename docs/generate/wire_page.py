@@ -88,7 +88,7 @@ def messages() -> list[type[Message]]:
 
 
 def _schemas(message: type[Message]) -> str:
-    """What this build reads, and where there are two, which of them it writes."""
+    """Returns the schemas that this build reads; of two, also the one which it writes."""
     readable = read_schemas(message)
     if len(readable) == 1:
         return f'`"{readable[0]}"`'

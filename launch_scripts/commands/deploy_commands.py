@@ -256,7 +256,7 @@ def revoke(folder: Path, names: list[str]) -> None:
 
 @command(app)
 def zenohd(
-    out: Path,
+    out: Annotated[Path, typer.Option()],
     tls: Tls,
     listen: list[str] | None = None,
     peer: list[str] | None = None,
@@ -267,7 +267,7 @@ def zenohd(
 ) -> None:
     """Write a configuration for zenohd as the router of a swarm.
 
-    swarm deploy zenohd router.json5 --listen tcp/127.0.0.1:7447 --plugins /usr/lib/zenoh
+    swarm deploy zenohd --out router.json5 --listen tcp/127.0.0.1:7447 --plugins /usr/lib/zenoh
 
     out       The file to write, for `zenohd -c FILE`.
     listen    Endpoint to listen at, such as tls/0.0.0.0:7447; repeat for several.
@@ -275,7 +275,7 @@ def zenohd(
     scenario  Scenario whose processes may take part: needed with certificates.
     plugins   Folder with libzenoh_plugin_storage_manager.so, to store marks, too.
     """
-    check_target(out, "OUT", force=force)
+    check_target(out, "--out", force=force)
     if scenario is None and tls.tls_ca is not None:
         raise ConfigError("certificates are for access control, by the names of a scenario's processes: --scenario")
     chosen = Scenario() if scenario is None else admitting_all(find_scenario(scenario))

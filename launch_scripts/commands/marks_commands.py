@@ -110,20 +110,20 @@ def show(store: Store, as_json: AsJson = False) -> None:
 
 
 @command(app)
-def export(store: Store, out: Path, force: Force = False) -> None:
+def export(store: Store, out: Annotated[Path, typer.Option()], force: Force = False) -> None:
     """Export the marks of a store.
 
     JSON holds all marks and learned factors. Other formats hold the winning marks as pixels or
     polygons.
 
-    swarm marks export runs/LAST/map.sqlite marks.json
+    swarm marks export runs/LAST/map.sqlite --out marks.json
 
-    swarm marks export runs/LAST/map.sqlite marks.gpkg
+    swarm marks export runs/LAST/map.sqlite --out marks.gpkg
 
     out  .json: all marks; .tif, {areas}: the winning marks.
     """
     terrain, grid, sets = _read(store)
-    check_target(out, "OUT", ".json", *TIFF, *AREAS, force=force)
+    check_target(out, "--out", ".json", *TIFF, *AREAS, force=force)
     ending = out.suffix.lower()
     marks, words = _parted(grid, sets)
     more = f", and learned factors of {number_of(len(words), 'author')}" if words else ""

@@ -422,7 +422,8 @@ def _fields(run: KnownRun, processes: int) -> dict[str, Any]:
 
     facts, report = run_facts(run.folder), run.folder / REPORT_FILE
     if run.launchers:
-        state = "stopped" if run.is_stopped else "running" if run.is_whole else "starting"
+        state = "ending" if run.is_ending else "running" if run.is_whole else "starting"
+        state = "stopped" if run.is_stopped else state
     elif processes:
         state = "left over"
     else:

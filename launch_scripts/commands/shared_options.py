@@ -61,7 +61,7 @@ ScenarioArgument = Annotated[
 Namespace = Annotated[
     str | None, from_environment("SWARM_NAMESPACE", help="Prefix of all keys: runs in different ones do not meet.")
 ]
-Runs = Annotated[Path, from_environment("SWARM_RUNS", help="Folder of the runs of this machine.")]
+Runs = Annotated[Path, from_environment("SWARM_RUNS", help="Folder that holds a folder for each run.")]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON on standard output, all else on standard error.")]
 PortOption = Annotated[
     int | None,
@@ -145,8 +145,8 @@ class Where(Tls):
 
     connect    The router's endpoint, such as tls/HOST:7447; by default that of the run.
     namespace  Prefix of all keys: runs in different ones do not meet.
-    run        The run to ask, if several run here: its name, or its folder.
-    runs       Find the swarm among the runs in this folder. Default: among all of yours here.
+    run        Name or folder of the run to ask, if several run here.
+    runs       Folder of runs to search. Default: all your runs on this machine.
     """
 
     panel: ClassVar[str | None] = NETWORK

@@ -371,9 +371,9 @@ class _Run:
         self._terminal.say(f"open {page_of(port)}: the terrain now, the live view in a moment", "bold")
         self._terminal.say(f"from another computer: run `{tunnel(port)}` there, then open the same address")
 
-    def _register(self) -> None:
+    def _register(self, **progress: bool) -> None:
         """Registers the run's progress for other commands; `begin_run` has reported any failure."""
-        register(self._run_dir, web_port=self._web_port, is_whole=self._startup_s is not None)
+        register(self._run_dir, web_port=self._web_port, is_whole=self._startup_s is not None, **progress)
 
     def _show(self, known: Recorder | OwnPart, now_ns: int, missing: list[str]) -> None:
         up = f"{len(self._swarm.running) - len(missing)} of {len(self._swarm.running)}"
@@ -393,10 +393,9 @@ class _Run:
         if self._startup_s is None:
             waits = f", waits for {', '.join(missing) or 'the first route'}" * (len(missing) < 4)
             return f"{self._scenario.name}: starting, {up} processes started here are up{waits}, {since_s:.0f} s"
-        of = "" if self._outlasts else self._limit(" of")
-        until = ", until the live view is closed, or Ctrl-C" if self._outlasts else ""
-        live = f"{until}, page {page_of(self._web_port)}" if self._web_port else ""
-        return f"{self._scenario.name}: {since_s:.0f} s{of}{live}"
+        until = ", until the live view is closed, or Ctrl-C" if self._outlasts else self._limit(" of")
+        live = f", page {page_of(self._web_port)}" if self._web_port else ""
+        return f"{self._scenario.name}: {since_s:.0f} s{until}{live}"
 
     def _limit(self, word: str) -> str:
         """Returns the word and how long the run lasts once the swarm is up; nothing if that has no limit."""
@@ -419,6 +418,7 @@ class _Run:
         self._terminal.close()
         asked = "; once more, and what still runs is killed" if self._stop_asked else ""
         self._terminal.say(f"stopping{asked}")
+        self._register(is_ending=True)
         swarm = self._swarm
         watcher.end([running.spec for running in swarm.running])
         with self._terminal.busy(

@@ -109,7 +109,7 @@ class Pen:
     """
 
     def __init__(self, streams: list[rr.RecordingStream], mesh: TerrainMesh) -> None:
-        """streams  the same is logged to each; others may be there the next time"""
+        """The same is logged to each of the streams; others may be there the next time."""
         self.streams, self.mesh = streams, mesh
         self._last: dict[tuple[str, str], Any] = {}
 
@@ -210,7 +210,7 @@ class Sinks:
         blueprint: rrb.Blueprint,
         page: LivePage | None = None,
     ) -> None:
-        """page  one that is served already; None: one is opened here"""
+        """The page is one that is served already; without it, one is opened here."""
         self._recording_id = recording_id
         self._blueprint = blueprint
         self._path = path

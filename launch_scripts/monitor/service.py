@@ -196,7 +196,7 @@ class MonitorService(MemberService):
     # --- out ----------------------------------------------------------------------------------------------------
 
     def _draw_frame(self, now_ns: int, viewers: int) -> None:
-        """viewers  how many have ever come"""
+        """Draws one frame; `viewers` is the number of those that have ever connected."""
         self._sync.tick(now_ns)
         for heard in self._observer.due(now_ns):
             self._hear(heard, now_ns)

@@ -291,7 +291,7 @@ class Recorder:
     messages."""
 
     def __init__(self, scenario: Scenario, grid: GridSpec, started_ns: int | None = None) -> None:
-        """started_ns  when the run began; None: with the first message"""
+        """The run began at `started_ns`; None: with the first message."""
         self.scenario = scenario
         self.grid = grid
         self.observed = LatestState(plan_of(scenario, started_ns), grid)

@@ -50,6 +50,7 @@ class _Entry(msgspec.Struct, frozen=True, kw_only=True):
     started_s: float
     web_port: Annotated[int, msgspec.Meta(ge=0, lt=1 << 16)] = 0
     is_whole: bool = False
+    is_ending: bool = False
 
 
 @dataclass(frozen=True)
@@ -59,12 +60,14 @@ class KnownRun:
     launchers  pids of its launchers that run on this machine, the newest first
     web_port   of the live page; 0 as long as it has none
     is_whole   the swarm has been whole
+    is_ending  its launchers end their processes, or write the report
     """
 
     folder: Path
     launchers: tuple[int, ...]
     web_port: int
     is_whole: bool
+    is_ending: bool = False
 
     @property
     def name(self) -> str:
@@ -87,18 +90,16 @@ def registry() -> Path:
     return Path(os.environ.get("SWARM_STATE") or state_folder()) / "runs"
 
 
-def register(folder: Path, *, web_port: int = 0, is_whole: bool = False) -> str | None:
+def register(folder: Path, **progress: Any) -> str | None:
     """Registers this process as a launcher of the run in a folder, or changes its entry. Returns a sentence if that
-    is impossible."""
+    is impossible.
+
+    progress  web_port, is_whole and is_ending of its entry
+    """
     try:
-        entry = _Entry(
-            folder=str(folder.resolve()),
-            pid=os.getpid(),
-            started_s=_started_s(os.getpid()),
-            web_port=web_port,
-            is_whole=is_whole,
-        )
-        file = registry() / f"{folder.name}.{os.getpid()}.json"
+        pid = os.getpid()
+        entry = _Entry(folder=str(folder.resolve()), pid=pid, started_s=_started_s(pid), **progress)
+        file = registry() / f"{folder.name}.{pid}.json"
         make_folder(file.parent)
         write_file(file, msgspec.json.encode(entry))
     except (OSError, RuntimeError, ValueError, StoreError) as error:  # ValueError: a name that is no UTF-8
@@ -119,9 +120,11 @@ def registered() -> list[KnownRun]:
                 found.setdefault(folder, []).append((entry, is_running))
     runs = []
     for folder, entries in found.items():
-        launchers = tuple(entry.pid for entry, is_running in entries if is_running)
+        running = [entry for entry, is_running in entries if is_running]
+        launchers = tuple(entry.pid for entry in running)
         web_port = max(entry.web_port for entry, _ in entries)
-        runs.append(KnownRun(folder, launchers, web_port, any(entry.is_whole for entry, _ in entries)))
+        is_whole = any(entry.is_whole for entry, _ in entries)
+        runs.append(KnownRun(folder, launchers, web_port, is_whole, all(entry.is_ending for entry in running)))
     return sorted(runs, key=lambda run: not run.launchers)
 
 

@@ -35,39 +35,39 @@ SUMMED: dict[str, str] = _LABELS["summed"]
 
 
 def count(value: float | None) -> str:
-    """12,345"""
+    """Returns text such as 12,345."""
     return NONE if value is None else f"{value:,.0f}"
 
 
 def seconds(value: float | None) -> str:
-    """34 s, 19 min"""
+    """Returns text such as 34 s, 19 min."""
     return NONE if value is None else str(Duration(value))
 
 
 def distance(value_m: float) -> str:
-    """480 m, 1.2 km"""
+    """Returns text such as 480 m, 1.2 km."""
     return f"{value_m:.0f} m" if value_m < 999.5 else f"{value_m / 1000:.1f} km"
 
 
 def duration(milliseconds: float | None) -> str:
-    """1.2 ms, 3.4 s"""
+    """Returns text such as 1.2 ms, 3.4 s."""
     if milliseconds is None:
         return NONE
     return f"{milliseconds:.1f} ms" if milliseconds < 999.95 else f"{milliseconds / 1000:.1f} s"
 
 
 def of_all(value: tuple[int, int]) -> str:
-    """15 of 16"""
+    """Returns text such as 15 of 16."""
     return f"{value[0]:,} of {value[1]:,}"
 
 
 def each(value: Mapping[str, int]) -> str:
-    """17 following, 1 arrived"""
+    """Returns text such as 17 following, 1 arrived."""
     return ", ".join(f"{number:,} {name}" for name, number in value.items() if number) or "none"
 
 
 def factors(value: Mapping[str, float]) -> str:
-    """grass x 2.9, forest x 0.63"""
+    """Returns text such as grass x 2.9, forest x 0.63."""
     return ", ".join(f"{name} x {factor:.2g}" for name, factor in value.items()) or "nothing"
 
 

@@ -358,7 +358,7 @@ def named_system(frame: MapFrame) -> str:
 
 
 def transform_of(grid: GridSpec) -> Any:
-    """rasterio's transform from pixels to metres of the map."""
+    """The transform of rasterio from pixels to metres of the map."""
     from rasterio.transform import from_origin
 
     return from_origin(grid.west_m, grid.north_m, grid.resolution_m, grid.resolution_m)

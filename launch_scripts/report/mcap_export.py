@@ -288,7 +288,7 @@ class _Words(msgspec.Struct):
 
 @dataclass(frozen=True, slots=True, order=True)
 class Line:
-    """time_ns as `RunTracks` counts; name, the sender"""
+    """The time is counted as by `RunTracks`; the name is that of the sender."""
 
     time_ns: int
     severity: Severity

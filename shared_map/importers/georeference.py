@@ -67,7 +67,7 @@ def equidistant(latitude_deg: float, longitude_deg: float) -> str:
 
 
 def system_named(text: str, what: str) -> Any:
-    """rasterio's CRS of a text, of which "local" means metres from anywhere. Raises TerrainError, which `what`
+    """The CRS of a text, as rasterio has it; "local" means metres from anywhere. Raises TerrainError, which `what`
     begins, if it is none."""
     try:
         with rasterio.Env(CPL_LOG="/dev/null"):  # PROJ would say it, too

@@ -209,7 +209,8 @@ class _Bucket:
 
 @dataclass(slots=True)
 class _Budget:
-    """
+    """Limits of one author.
+
     own       fills at the rate of one process
     share     fills at this process's part of the total rate: others cannot use it
     heard_ns  when a set of it was merged last

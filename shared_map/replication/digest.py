@@ -199,7 +199,8 @@ _LAST = (1 << 62, 0)
 
 @dataclass(slots=True)
 class PendingDigest:
-    """
+    """A digest that waits for its comparison.
+
     due_ns  compare it then
     tries   how often it was compared
     """

@@ -40,7 +40,7 @@ class MapFrame:
 
     @cached_property
     def system(self) -> Any:
-        """rasterio's CRS of the map. Raises ConfigError if it has none, or one that is not known."""
+        """The CRS of the map, as rasterio has it. Raises ConfigError if it has none, or one that is not known."""
         import rasterio
         from rasterio.errors import CRSError
 
@@ -55,7 +55,7 @@ class MapFrame:
 
     @cached_property
     def degrees(self) -> Any:
-        """rasterio's CRS of latitudes and longitudes on the body on which the map lies."""
+        """The CRS of latitudes and longitudes on the body on which the map lies."""
         from shared_map.importers.georeference import degrees_of
 
         return degrees_of(self.system)

@@ -98,7 +98,7 @@ def build_terrain(scenario: Scenario, progress: Progress = no_progress, vehicle_
 
 
 def _built(scenario: Scenario, source: Source, progress: Progress, common: CostConfig) -> Terrain:
-    """common  the cost by which roads are laid: they are the same for every class"""
+    """Roads are laid by the cost `common`: they are the same for every class."""
     grid, classes, cost = source.grid, source.classes, scenario.cost
     notes = list(source.notes)
     ground = _ground(source, classes, cost, progress)

@@ -327,7 +327,7 @@ _REST: dict[str, Any] = {
 
 @dataclass(frozen=True, slots=True, eq=False)
 class JobDone(bus.WorkDone):
-    """number  of the job among those that were submitted, from 0; reads  what it read of the outside"""
+    """The number counts the submitted jobs from 0; `reads` is what the job read of the outside."""
 
     number: int
     reads: Sequence[tuple[str, bytes]]

@@ -60,7 +60,7 @@ Messages (`swarm.wire.messages.traffic`), of which all but `Left` carry the whol
 since a state that the receiver has:
 
 `HostState`     Host to leader: all vehicles of the host that hold or want a cell of one shard, each with its
-                next cells (`Stand`, made of a `Wish`). `knows` is the newest table that the host acts on: of
+                next cells (`Stand`, made of a `CellRequest`). `knows` is the newest table that the host acts on: of
                 all entries up to that table, the host holds only those listed in this state. `dead` are generations
                 that are proved to have ended, by which their entries are over.
 `Table`         Leader to members: the entries of one shard, or those that differ from an earlier table. Its stamp

@@ -17,7 +17,7 @@ from swarm.clock import NS_PER_S
 from swarm.config.scenario import agent_of
 from swarm.errors import StoreError
 from swarm.grid import REGION_CELLS
-from swarm.right_of_way.holdings import Tell, Wish
+from swarm.right_of_way.holdings import CellRequest, Tell
 from swarm.right_of_way.host import GENERATIONS_KEPT, AskKnown, Host
 from swarm.right_of_way.shard_member import Member, MemberAction, Refused, RoundTrips
 from swarm.right_of_way.shards import Shards
@@ -195,10 +195,10 @@ class RightOfWay:
         for member in self._members.values():
             member.revoke(names, now_ns)
 
-    def hear_host_state(self, standing: HostState, now_ns: int) -> None:
-        member = self._member(standing.shard, now_ns)
+    def hear_host_state(self, state: HostState, now_ns: int) -> None:
+        member = self._member(state.shard, now_ns)
         if member is not None:
-            member.hear_host_state(standing, now_ns)
+            member.hear_host_state(state, now_ns)
 
     def hear_table(self, table: Table, now_ns: int) -> list[Action]:
         member = self._member(table.shard, now_ns)
@@ -220,7 +220,7 @@ class RightOfWay:
 
     # --- time passes ----------------------------------------------------------------------------------------
 
-    def tick(self, wishes: Mapping[str, Wish], now_ns: int) -> list[Action]:
+    def tick(self, requests: Mapping[str, CellRequest], now_ns: int) -> list[Action]:
         """Returns the messages of our members and our vehicles to send now."""
         actions: list[Action] = [Refused(text) for text in self.host.refused]
         self.host.refused.clear()
@@ -231,7 +231,7 @@ class RightOfWay:
         if self.host.replaced:
             self.host.watch(self._known_of(self.agent, self.own.disk).shards)
         actions += self.host.lefts(now_ns)
-        actions += self.host.standings(wishes, now_ns)
+        actions += self.host.host_states(requests, now_ns)
         if self.host.ended_alone(now_ns):
             actions.append(AskKnown())
         return actions

@@ -14,7 +14,7 @@ from swarm.clock import NS_PER_S
 from swarm.config.scenario import plan_agents
 from swarm.peers import Peer
 from swarm.right_of_way.agent_core import Action, OwnRecord, RightOfWay
-from swarm.right_of_way.holdings import Tell, Wish
+from swarm.right_of_way.holdings import CellRequest, Tell
 from swarm.right_of_way.host import AskKnown
 from swarm.right_of_way.promise_store import PromiseStore
 from swarm.right_of_way.shard_member import SLOW_NS, AskPromises, Refused, Save
@@ -205,7 +205,7 @@ class RightOfWaySync:
                 self.core.hear_host_state(message, self._own_time.at(now_ns))
         return []
 
-    def tick(self, wishes: Mapping[str, Wish], now_ns: int) -> None:
+    def tick(self, requests: Mapping[str, CellRequest], now_ns: int) -> None:
         own_ns = self._own_time.tick(now_ns)
         asked_ns = self._asked_ns
         waited = asked_ns is None or not 0 <= now_ns - asked_ns < _FIRST_ANSWERS_NS
@@ -215,7 +215,7 @@ class RightOfWaySync:
         if waited and asked_ns is not None:
             self._begin()
         self._take_standings(now_ns)
-        self._perform(self.core.tick(wishes, own_ns))
+        self._perform(self.core.tick(requests, own_ns))
         self._tell_slow(now_ns)
         for shard, text in self.core.host.unled(own_ns).items():
             if now_ns >= self._unled_due_ns.get(shard, now_ns):
@@ -329,9 +329,9 @@ class RightOfWaySync:
             match action:
                 case AskKnown():
                     self._asked_ns, self._unasked, self._known_tag = None, True, ""  # at the next tick
-                case Tell(members, standing):
+                case Tell(members, state):
                     for member in members:
-                        self.bus.publish(HOST_STATE, standing, shard=standing.shard, member=member, agent=self._id)
+                        self.bus.publish(HOST_STATE, state, shard=state.shard, member=member, agent=self._id)
                 case traffic.Left():
                     self.bus.publish(LEFT, action, host=action.host, agent=self._id)
                 case traffic.Granted():

@@ -192,9 +192,9 @@ class ExternalService:
                     self._ask(now_ns)
                 case Left() as left:
                     self.bus.publish(LEFT, left, host=left.host, agent=self.name)
-                case Tell(members, standing):
+                case Tell(members, state):
                     for member in members:
-                        self.bus.publish(HOST_STATE, standing, shard=standing.shard, member=member, agent=self.name)
+                        self.bus.publish(HOST_STATE, state, shard=state.shard, member=member, agent=self.name)
 
     def _chance(self, now_ns: int) -> int:
         seed = f"{self.name}/{self.incarnation}/{now_ns}".encode()
@@ -443,7 +443,7 @@ def say_gone(bus: Bus, name: str, grid: GridSpec, timeout_s: float) -> bool:
             due_ns = now_ns + int(_TICK_S * NS_PER_S)
             for told in removal.tick(now_ns):
                 for member in told.members:
-                    bus.publish(HOST_STATE, told.standing, shard=told.standing.shard, member=member, agent=name)
+                    bus.publish(HOST_STATE, told.state, shard=told.state.shard, member=member, agent=name)
             if removal.done:
                 return True
     return False

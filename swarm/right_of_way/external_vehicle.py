@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from itertools import pairwise
 
 from swarm.clock import NS_PER_S
-from swarm.right_of_way.holdings import MOST_AHEAD, Tell, Wish
+from swarm.right_of_way.holdings import MOST_AHEAD, CellRequest, Tell
 from swarm.right_of_way.host import GENERATIONS_KEPT, AskKnown, Host
 from swarm.right_of_way.shards import Shards
 from swarm.wire.fields import MOST_IDS
@@ -90,7 +90,7 @@ class ExternalVehicle:
         """Its cell, or the one that it would enter; None while it is away."""
         self._path: tuple[int, ...] = ()
         self._aside: tuple[int, ...] = ()
-        self._wish = Wish()
+        self._request = CellRequest()
         self._since_ns: int | None = None
         """Since when it has wanted to go somewhere; None while it does not."""
         self._waits_ns: tuple[int, int] | None = None
@@ -200,8 +200,8 @@ class ExternalVehicle:
             # Not that it has ended, as a host would: its vehicle still stands there.
             return [AskKnown()] if self.host.ended_alone(now_ns) and self._cell is not None else []
         self._wait(now_ns)
-        standings = self.host.standings({self.vehicle: self._wish_now(now_ns)}, now_ns)
-        return [*self.host.lefts(now_ns), *standings]
+        host_states = self.host.host_states({self.vehicle: self._request_now(now_ns)}, now_ns)
+        return [*self.host.lefts(now_ns), *host_states]
 
     def _wait(self, now_ns: int) -> None:
         """Gives back what it waits for in vain, so that no circle of waiting lasts."""
@@ -214,7 +214,7 @@ class ExternalVehicle:
             else:
                 self._waits_ns = cell, since_ns
 
-    def _wish_now(self, now_ns: int) -> Wish:
+    def _request_now(self, now_ns: int) -> CellRequest:
         held, path = self.host.path(self.vehicle), self._path
         after = path.index(held[-1]) + 1 if held and held[-1] in path else len(path)
         ahead = list(path[after : after + max(MOST_AHEAD + 1 - len(held), 0)])
@@ -222,12 +222,12 @@ class ExternalVehicle:
         wants = list(dict.fromkeys((*ahead[:1], *self._aside))) if len(held) == 1 else []
         pushed = self.host.pushed.get(self.vehicle, 0)
         better = len(wants) if pushed else len(ahead[:1]) if wants else 0
-        # In whole seconds, so that a wish is the same object while nothing happens.
+        # In whole seconds, so that a request is the same object while nothing happens.
         age_s = (now_ns - self._since_ns) // NS_PER_S if self._since_ns is not None else 0
-        wish = Wish(ahead, wants[:8], min(better, 8), max(min(age_s * 1000, _OLDEST_MS), pushed))
-        if wish != self._wish:
-            self._wish = wish
-        return self._wish
+        request = CellRequest(ahead, wants[:8], min(better, 8), max(min(age_s * 1000, _OLDEST_MS), pushed))
+        if request != self._request:
+            self._request = request
+        return self._request
 
 
 class Removal:
@@ -264,4 +264,4 @@ class Removal:
         self.host.begin_as(self.host.generation, generations)  # which has ended, too: no vehicle drives by it
 
     def tick(self, now_ns: int) -> list[Tell]:
-        return [] if self.host.replaced else self.host.standings({}, now_ns)
+        return [] if self.host.replaced else self.host.host_states({}, now_ns)

@@ -40,7 +40,7 @@ _MOST_CELLS = 1 << 12
 """Cells whose shard is remembered: more than the vehicles of one host have near them."""
 
 
-class Wish(msgspec.Struct, frozen=True):
+class CellRequest(msgspec.Struct, frozen=True):
     """Candidate cells of a vehicle, in order of preference.
 
     ahead   its next cells after all that it holds
@@ -54,7 +54,7 @@ class Wish(msgspec.Struct, frozen=True):
     age_ms: int = 0
 
 
-_NO_WISH = Wish()
+_NO_REQUEST = CellRequest()
 
 
 def part_of(generation: int, grants: Mapping[str, Held], waits: Mapping[str, Sequence[Entry]]) -> int:
@@ -69,7 +69,7 @@ class Tell:
     """Send a host state to these members of its shard."""
 
     members: tuple[str, ...]
-    standing: HostState
+    state: HostState
 
 
 _Told = tuple[Stand, object]
@@ -122,7 +122,7 @@ class _View:
 class _Said(msgspec.Struct, frozen=True):
     """Statement about one vehicle, and the shards to which it was made."""
 
-    wish: Wish
+    request: CellRequest
     path: list[int]
     held: list[Number]
     shards: Set[int]
@@ -402,13 +402,13 @@ class Holdings:
 
     # --- what to say ----------------------------------------------------------------------------------------
 
-    def standings(self, wishes: Mapping[str, Wish], now_ns: int) -> list[Tell]:
+    def host_states(self, requests: Mapping[str, CellRequest], now_ns: int) -> list[Tell]:
         """Returns the statements for each shard that concerns us, if they are new or the last one is a heartbeat
         old. Cells that a statement omits are released."""
         if not self.generation:
             return []
         self._seq += 1
-        self._say_changed(wishes)
+        self._say_changed(requests)
         concerned = {**self.watched, **{shard: None for shard, view in self._views.items() if view.stands}}
         by_shard = {shard: {**self._views[shard].stands} for shard in concerned}
         entries = self._entries
@@ -450,18 +450,18 @@ class Holdings:
                     words.setdefault(host, []).extend(left)
         return [Left(agent=self.name, host=host, entries=numbers) for host, numbers in words.items()]
 
-    def _say_changed(self, wishes: Mapping[str, Wish]) -> None:
-        """Renews the statement about each placed vehicle whose path, wish or granted cells have changed."""
+    def _say_changed(self, requests: Mapping[str, CellRequest]) -> None:
+        """Renews the statement about each placed vehicle whose path, request or granted cells have changed."""
         anew, self._seen_anew = self._seen_anew, set()
         for vehicle, path in self._paths.items():
-            before, wish = self._said.get(vehicle), wishes.get(vehicle, _NO_WISH)
+            before, request = self._said.get(vehicle), requests.get(vehicle, _NO_REQUEST)
             if (
                 before is None
-                or before.wish is not wish
+                or before.request is not request
                 or not (before.path is path or self._is_no_news(before, path))
                 or vehicle in anew
             ):
-                said = self._said[vehicle] = self._say(vehicle, path, wish)
+                said = self._said[vehicle] = self._say(vehicle, path, request)
                 before_at = set[int]() if before is None else before.shards
                 if before_at != said.shards:
                     self._say_all_again()
@@ -483,7 +483,7 @@ class Holdings:
     def _tell(self, shard: int, stands: list[Stand], now_ns: int) -> Tell:
         """Returns the statement about these, for one leader as changes since one that it has."""
         view, members = self._views[shard], self._listeners(shard, now_ns)
-        standing = HostState(
+        state = HostState(
             shard=shard,
             agent=self.name,
             generation=self.generation,
@@ -496,8 +496,8 @@ class Holdings:
         )
         base = view.sent.get(view.heard) if members == (view.leader,) else None
         if self.shards.reads_changes(self.name):
-            keep_last(view.sent, self._seq, standing, STATES_KEPT)
-        return Tell(members, standing if base is None else standing.changes(base))
+            keep_last(view.sent, self._seq, state, STATES_KEPT)
+        return Tell(members, state if base is None else state.changes(base))
 
     def _listeners(self, shard: int, now_ns: int) -> tuple[str, ...]:
         view = self._views[shard]
@@ -521,11 +521,11 @@ class Holdings:
         view.told_ns = now_ns
         return True
 
-    def _say(self, vehicle: str, path: list[int], wish: Wish) -> _Said:
+    def _say(self, vehicle: str, path: list[int], request: CellRequest) -> _Said:
         """States a vehicle to each shard that it is near."""
-        ahead, wants, better = [*wish.ahead], list[int](), 0
+        ahead, wants, better = [*request.ahead], list[int](), 0
         if len(path) == 1:
-            wants, better = [*wish.wants], wish.better
+            wants, better = [*request.wants], request.better
         shard_of = self._shard_of
         concerned = [*path, *ahead[:1], *wants]
         near: Set[int] = {*map(shard_of, concerned)}
@@ -534,11 +534,11 @@ class Holdings:
         held = [entry.number for entry in self._entries.paths[vehicle]]
         for shard in near:
             holds = Held.of(held if len(near) == 1 else [each for each in held if shard_of(each[0]) == shard])
-            stand = Stand(vehicle, path[0], path[-1], holds, ahead, wants, better, wish.age_ms, self.keeps)
+            stand = Stand(vehicle, path[0], path[-1], holds, ahead, wants, better, request.age_ms, self.keeps)
             view = self._views.setdefault(shard, _View())
             view.same = False
             view.stands[vehicle] = stand, (vehicle, path[0], holds, ahead, better)
-        return _Said(wish, path, held, near)
+        return _Said(request, path, held, near)
 
     def _forget_left(self, by_shard: Mapping[int, Mapping[str, _Told]]) -> None:
         """Leaves the shards where we hold and want nothing, once their tables show that they know it."""

@@ -80,7 +80,7 @@ def _lot(vehicle: str, step: int) -> int:
 class _Host:
     """Known state of a host.
 
-    standing  the newest of its newest generation, and when it came; None if none counts
+    state     the newest of its newest generation, and when it came; None if none counts
     stands    of that, vehicle -> its stand, for vehicles that the host may speak for
     asking    those of them that are at rest, or request more than they are granted; other vehicles under way
               request nothing now
@@ -91,7 +91,7 @@ class _Host:
     """
 
     spoke_ns: int
-    standing: HostState | None = None
+    state: HostState | None = None
     stands: dict[str, Stand] = field(default_factory=dict)
     asking: Sequence[Stand] = ()
     heard_ns: int = 0
@@ -145,8 +145,8 @@ class Leader:
 
     # --- what hosts say -------------------------------------------------------------------------------------
 
-    def take_host_state(self, standing: HostState, now_ns: int) -> None:
-        host = standing.agent
+    def take_host_state(self, state: HostState, now_ns: int) -> None:
+        host = state.agent
         if not self._is_welcome(host):
             self.refused.append(
                 f"shard {self._shard} has known {MOST_EXTERNALS} external vehicles: {host} cannot enter"
@@ -158,44 +158,40 @@ class Leader:
         known = self._hosts[host]
         known.spoke_ns = now_ns
         generation, seq = self._orders.hosts.get(host, (0, 0))
-        if standing.ended:
-            for ended in (*standing.dead, standing.generation):
+        if state.ended:
+            for ended in (*state.dead, state.generation):
                 self._granted |= self._orders.end(host, ended)
             return
-        if (standing.generation, standing.seq) <= (generation, seq):
+        if (state.generation, state.seq) <= (generation, seq):
             return
-        known.changes = standing.since > 0
-        if (whole := standing.whole(known.said)) is None:
+        known.changes = state.since > 0
+        if (whole := state.whole(known.said)) is None:
             return
-        standing = whole
-        if is_far_ahead(standing.generation, generation):
-            self.refused.append(f"{host} names a generation that is implausibly far ahead: {standing.generation}")
+        state = whole
+        if is_far_ahead(state.generation, generation):
+            self.refused.append(f"{host} names a generation that is implausibly far ahead: {state.generation}")
             return
         fenced = {each for name, each in self._orders.fenced if name == host}
-        if (
-            standing.generation != generation
-            and len(fenced) >= GENERATIONS_KEPT
-            and fenced.isdisjoint(standing.dead)
-        ):
+        if state.generation != generation and len(fenced) >= GENERATIONS_KEPT and fenced.isdisjoint(state.dead):
             self.refused.append(f"{host} has {len(fenced)} generations here which are not known to have ended")
             return
-        if standing.generation != generation:
+        if state.generation != generation:
             known.told = None
             self.seq += 1  # two generations of one tick are given different entries
-        if not standing.vehicles and (known.standing is None or known.standing.vehicles):
+        if not state.vehicles and (known.state is None or known.state.vehicles):
             self._changed = True  # it leaves the shard as soon as a table counts this
-        stands = self._stands_of(standing)
+        stands = self._stands_of(state)
         holds = {id: stand.holds for id, stand in stands.items()}
         bodies = {id: stand.cell for id, stand in stands.items() if is_entering(stand)}
         before = self._orders.by_host_count(host)
         self._granted |= self._orders.take_host_state(
-            host, standing.generation, standing.seq, holds, standing.knows, standing.dead, bodies, self._next_stamp
+            host, state.generation, state.seq, holds, state.knows, state.dead, bodies, self._next_stamp
         )
         self._changed |= self._orders.by_host_count(host) != before
         self.seq = max(self.seq, self._orders.newest - 1)  # the next table is not older than its entries
-        known.standing, known.stands, known.heard_ns = standing, stands, now_ns
+        known.state, known.stands, known.heard_ns = state, stands, now_ns
         if self._shards.reads_changes(host):
-            keep_last(known.said, (standing.generation, standing.seq), standing, STATES_KEPT)
+            keep_last(known.said, (state.generation, state.seq), state, STATES_KEPT)
         known.asking = [stand for stand in stands.values() if stand.ahead or stand.cell == stand.end]
 
     def _is_welcome(self, host: str) -> bool:
@@ -206,12 +202,12 @@ class Leader:
         known = self._orders.hosts.keys() | self._hosts.keys()
         return len(known - self._fleets.keys()) < MOST_EXTERNALS
 
-    def _stands_of(self, standing: HostState) -> dict[str, Stand]:
+    def _stands_of(self, state: HostState) -> dict[str, Stand]:
         """Returns vehicle -> its stand, for vehicles that the host may speak for."""
-        fleet = self._fleets.get(standing.agent)
+        fleet = self._fleets.get(state.agent)
         if fleet is None:
-            return {each.vehicle: each for each in standing.vehicles if agent_of(each.vehicle) == standing.agent}
-        return {each.vehicle: each for each in standing.vehicles if each.vehicle in fleet}
+            return {each.vehicle: each for each in state.vehicles if agent_of(each.vehicle) == state.agent}
+        return {each.vehicle: each for each in state.vehicles if each.vehicle in fleet}
 
     # --- what is granted ------------------------------------------------------------------------------------
 
@@ -245,7 +241,7 @@ class Leader:
 
     def _since_used(self, granted: Granted, host: _Host) -> Granted:
         """Returns a grant, to a host that sends changes as changes since the one that it has used."""
-        used = host.standing.knows if host.changes and host.standing is not None else (0, 0)
+        used = host.state.knows if host.changes and host.state is not None else (0, 0)
         base, _ = self._content.get(used, {}).get(granted.host, (None, None))
         return granted if base is None or base.generation != granted.generation else granted.changes(base)
 
@@ -257,7 +253,7 @@ class Leader:
         for name, host in self._hosts.items():
             grants, waits = orders.granted(name)
             # Also around those under way: their requests once they come to rest depend on the cells around.
-            stands = () if host.standing is None else host.standing.vehicles
+            stands = () if host.state is None else host.state.vehicles
             near = set[int]().union(*(cells_beside(stand.end, cols) for stand in stands))
             generation, heard = table.hosts.get(name, (0, 0))
             granted = Granted(
@@ -280,9 +276,7 @@ class Leader:
 
     def _plan(self, now_ns: int) -> None:
         hosts = [
-            host
-            for host in self._hosts.values()
-            if host.standing is not None and now_ns - host.heard_ns <= SILENT_NS
+            host for host in self._hosts.values() if host.state is not None and now_ns - host.heard_ns <= SILENT_NS
         ]
         # The vehicle that has been on its way for longest goes first.
         asking = sorted(chain.from_iterable([host.asking for host in hosts]), key=_turn)
@@ -310,11 +304,11 @@ class Leader:
             elif (ahead := self._next_ahead(stand)) and not self._orders.waits(stand.vehicle):
                 self._grant(stand, ahead, round.taken)
         # Vehicles that make way are granted first, so that others may follow them.
-        standing = {mover.cell: id for id, mover in movers.items() if not mover.outside}
+        still = {mover.cell: id for id, mover in movers.items() if not mover.outside}
         granted: set[str] = set()
         for stand in [each for each in asking if each.vehicle in round.to]:
             chain_of = [stand.vehicle]
-            while (next := standing.get(round.to.get(chain_of[-1], -1))) is not None and next not in chain_of:
+            while (next := still.get(round.to.get(chain_of[-1], -1))) is not None and next not in chain_of:
                 chain_of.append(next)
             for vehicle in reversed(chain_of):
                 to = round.to.get(vehicle)

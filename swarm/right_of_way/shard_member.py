@@ -199,7 +199,7 @@ class Member:
 
     # --- what hosts say -------------------------------------------------------------------------------------
 
-    def hear_host_state(self, standing: HostState, now_ns: int) -> None:
+    def hear_host_state(self, state: HostState, now_ns: int) -> None:
         if now_ns - self._wanted_ns > _WANTED_NS:
             # A new shard cannot have another leader; and hosts receive no more from the previous one.
             led = self.promised and now_ns >= self._led_until_ns + self._lease_ns
@@ -208,9 +208,9 @@ class Member:
             self._acked_ns = dict.fromkeys(self._others, now_ns)
         self._wanted_ns = now_ns
         if self._witness is not None:
-            self._witness.hear_host_state(standing, now_ns)
+            self._witness.hear_host_state(state, now_ns)
         if self.leader is not None:
-            self.leader.take_host_state(standing, now_ns)
+            self.leader.take_host_state(state, now_ns)
 
     # --- what members say -----------------------------------------------------------------------------------
 

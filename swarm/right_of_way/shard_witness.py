@@ -109,18 +109,18 @@ class _Host:
     told: object = None
     told_ns: int = 0
 
-    def hear(self, standing: HostState, now_ns: int) -> None:
+    def hear(self, state: HostState, now_ns: int) -> None:
         self.spoke_ns = now_ns
-        self.ended.update(standing.dead)
-        if standing.ended:
-            self.ended.add(standing.generation)
+        self.ended.update(state.dead)
+        if state.ended:
+            self.ended.add(state.generation)
         self.ended.intersection_update(sorted(self.ended)[-2 * GENERATIONS_KEPT :])
-        if (standing.generation, standing.seq) > self.newest:
-            self.newest = standing.generation, standing.seq
-            held = frozenset(number for stand in standing.vehicles for number in stand.holds)
-            self.generations[standing.generation] = standing.knows, held, standing.never
-            self.there = {(stand.vehicle, stand.cell): False for stand in standing.vehicles if is_entering(stand)}
-            held_cells = ((each.vehicle, cell) for each in standing.vehicles for cell in each.holds.cells)
+        if (state.generation, state.seq) > self.newest:
+            self.newest = state.generation, state.seq
+            held = frozenset(number for stand in state.vehicles for number in stand.holds)
+            self.generations[state.generation] = state.knows, held, state.never
+            self.there = {(stand.vehicle, stand.cell): False for stand in state.vehicles if is_entering(stand)}
+            held_cells = ((each.vehicle, cell) for each in state.vehicles for cell in each.holds.cells)
             self.there.update(dict.fromkeys(held_cells, True))
             for old in sorted(self.generations)[:-GENERATIONS_KEPT]:
                 del self.generations[old]
@@ -168,8 +168,8 @@ class Witness:
         self._lacks: dict[str, list[Number]] = {}
         """Host of which a statement is missed -> entries that it may have left."""
 
-    def hear_host_state(self, standing: HostState, now_ns: int) -> None:
-        self._hosts.setdefault(standing.agent, _Host(now_ns)).hear(standing, now_ns)
+    def hear_host_state(self, state: HostState, now_ns: int) -> None:
+        self._hosts.setdefault(state.agent, _Host(now_ns)).hear(state, now_ns)
 
     def accepts(self, old: Table, new: Table) -> bool:
         """Returns True if a table may replace the one on file: what it omits is over by the word of its own host,

@@ -11,7 +11,7 @@ from functools import partial
 import msgspec
 import pytest
 from support.broken_rules import Broken, in_place_of
-from support.shard_tables import GRID, MEMBERS, holdings_of, standing
+from support.shard_tables import GRID, MEMBERS, holdings_of, host_state
 from support.thief import Thief, ThiefWorld
 from support.traffic_world import Faults, Process, TrafficWorld, random_faults
 
@@ -118,9 +118,9 @@ def two_of_four_are_enough(begin, self, *what, **named):
 
 
 @in_place_of(Witness, "hear_host_state")
-def members_store_entries_of_hosts_that_never_spoke(hear, self, standing, now_ns):
-    for name in (standing.agent, "ghost"):
-        self._hosts.setdefault(name, _Host(now_ns)).hear(standing, now_ns)
+def members_store_entries_of_hosts_that_never_spoke(hear, self, state, now_ns):
+    for name in (state.agent, "ghost"):
+        self._hosts.setdefault(name, _Host(now_ns)).hear(state, now_ns)
 
 
 @in_place_of(Member, "revoke")
@@ -188,9 +188,9 @@ def test_a_member_stores_no_table_that_breaks_a_rule(lie: dict[str, object]) -> 
     witness = Witness("a2", shards, {f"a{n}": [f"a{n}-00"] for n in range(4)})
     entering = Stand("a0-00", 9, 9, Held(), [9], [], 0, 0)
     for generation in (FIRST, SECOND):
-        witness.hear_host_state(standing("a1", [(20, 1, 1)], 1, (1, 5), generation=generation), 0)
+        witness.hear_host_state(host_state("a1", [(20, 1, 1)], 1, (1, 5), generation=generation), 0)
     again = {"generation": SECOND, "vehicles": [entering], "dead": [FIRST]}
-    witness.hear_host_state(standing("a0", [(9, 1, 1)], 1, (1, 5), **again), 0)
+    witness.hear_host_state(host_state("a0", [(9, 1, 1)], 1, (1, 5), **again), 0)
     true = msgspec.structs.replace(OLD, seq=6, hosts={**OLD.hosts, "a0": (SECOND, 1)})
     assert witness.accepts(OLD, true)
     told = {id: Held.of(numbers) for id, numbers in lie.items() if "-" in id}  # type: ignore[arg-type]
@@ -214,5 +214,5 @@ def test_a_member_remembers_the_newest_of_the_starts_that_have_ended() -> None:
     """A host may name any number of them, in any order."""
     host = _Host(0)
     for seq, start in enumerate(random.Random(1).sample(range(1, 1000), 999)):
-        host.hear(standing("a1", [(20, 1, 1)], seq, generation=start, dead=[start], ended=True), 0)
+        host.hear(host_state("a1", [(20, 1, 1)], seq, generation=start, dead=[start], ended=True), 0)
     assert host.ended == {*range(1000 - 2 * GENERATIONS_KEPT, 1000)}

@@ -108,7 +108,7 @@ def a_silent_external_loses_its_cells(tick, self, now_ns):
 def a_robot_that_is_replaced_says_that_it_has_ended(tick, self, now_ns):
     if not self.host.replaced:
         return tick(self, now_ns)
-    actions = self.host.standings({}, now_ns)
+    actions = self.host.host_states({}, now_ns)
     self.host.ended_alone(now_ns)
     return actions
 

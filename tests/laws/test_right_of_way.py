@@ -20,7 +20,7 @@ from hypothesis import strategies as st
 from support import broken_rules as rules
 from support.broken_rules import in_place_of
 from support.effort import few
-from support.shard_tables import AGENTS, MEMBERS, SHARDS, standing, table_of
+from support.shard_tables import AGENTS, MEMBERS, SHARDS, host_state, table_of
 from support.traffic_world import TICK_NS, Faults, Process, TrafficWorld, random_faults
 
 from swarm.grid import GridSpec
@@ -187,7 +187,7 @@ def test_a_vehicle_does_not_wait_for_its_own_entry_of_an_earlier_generation() ->
 def test_a_statement_that_is_heard_again_says_nothing_of_a_host_that_is_silent() -> None:
     leader = Leader(SHARDS, MEMBERS[0], 1, table_of(1, 1, a1=[5]), {name: [f"{name}-00"] for name in AGENTS})
     for now_ns in (3, 9):
-        leader.take_host_state(standing("a1", [(5, 1, 1)], 2, (1, 1)), now_ns)
+        leader.take_host_state(host_state("a1", [(5, 1, 1)], 2, (1, 1)), now_ns)
     assert leader._hosts["a1"].heard_ns == 3
 
 
@@ -339,9 +339,9 @@ def seats_a_file_that_is_not_the_first(begin, self, chance):
     return actions
 
 
-@in_place_of(Holdings, "standings")
-def acts_on_a_table_that_is_not_the_newest(standings, self, wishes, now_ns):
-    said = standings(self, wishes, now_ns)
+@in_place_of(Holdings, "host_states")
+def acts_on_a_table_that_is_not_the_newest(host_states, self, requests, now_ns):
+    said = host_states(self, requests, now_ns)
     for known in (self._views, self._entries.knows, self._entries.over):
         for shard in [shard for shard in known if shard not in self.watched]:
             del known[shard]

@@ -2,14 +2,19 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
+import re
+import socket
 import subprocess
 from pathlib import Path
 
 import pytest
-from support.live_swarm import SWARM, folders_of_runs
-from support.processes import eventually, in_session
+from support.live_swarm import SMALL_WORLD, SWARM, folders_of_runs
+from support.monitor_rig import taking
+from support.processes import Child, eventually, in_session
 
+from launch_scripts.observe.run_folders import registry
 from launch_scripts.report.report_and_tracks import TRACKS_FILE, read_tracks
 
 pytestmark = [pytest.mark.network, pytest.mark.slow]
@@ -42,3 +47,49 @@ def test_a_short_demo_ends_well_and_its_report_says_so(tmp_path: Path) -> None:
         assert (run_dir / f"{log}.log").stat().st_size > 0, log
     for name in ("run.rrd", "report.png"):
         assert (run_dir / name).stat().st_size > 0, name
+
+
+SHORT_DEMO = f"""
+name = "short"
+seconds = 12
+{SMALL_WORLD}
+[monitor]
+web_port = 0
+"""
+"""A scenario that ends by itself later than `up` takes a viewer for one that has left."""
+PAGE = r"open http://127\.0\.0\.1:(\d+)"
+STAYS = "until the live view is closed"
+
+
+def open_stream(port: int) -> list[socket.socket]:
+    """The stream of a live view, as its page holds it; none while only the start page is there."""
+    with contextlib.suppress(OSError):
+        stream = socket.create_connection(("127.0.0.1", port), timeout=30)
+        stream.sendall(taking())
+        if b" 200 " in stream.recv(13):
+            return [stream]
+        stream.close()
+    return []
+
+
+def test_the_demo_goes_on_while_a_viewer_is_connected_and_ends_by_itself_after_it(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("SWARM_STATE", str(tmp_path / "state"))
+    (tmp_path / "demo").write_text(SHORT_DEMO)  # a file in the working directory precedes the built-in scenario
+    command = [*SWARM, "demo", "--port", "0", "--plain"]
+    with Child(tmp_path / "output.txt", *command, cwd=tmp_path, start_new_session=True) as demo:
+        demo.wait_for(PAGE)
+        streams: list[socket.socket] = []
+        eventually(
+            lambda: streams.extend(open_stream(int(re.findall(PAGE, demo.text)[-1]))) or streams, 90, "a stream"
+        )
+        with streams[0] as stream:
+            # A line comes each 5 s: the fourth is later than the 10 s for which a page may be loaded again.
+            eventually(lambda: not stream.recv(1 << 18) or demo.text.count(STAYS) >= 4, 150, STAYS)
+            assert demo.process.poll() is None, demo.text
+        eventually(lambda: demo.process.poll() is not None, 120, "the end of the demo without a viewer")
+        assert demo.process.returncode == 0, demo.text
+        eventually(lambda: not in_session(demo.process.pid), 5, "the end of all")
+    (entry,) = registry().glob("*.json")
+    assert json.loads(entry.read_text())["is_ending"], "`swarm ps` says so while the report is written"

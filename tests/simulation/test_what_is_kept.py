@@ -57,13 +57,13 @@ def test_events_are_those_of_agents_that_keep_nothing_and_look_at_all_vehicles(n
     looked, logs, make = [0, 0], [io.StringIO(), io.StringIO()], CellRequests.make
     run = 0
 
-    def make_wishes(wishes: CellRequests, vehicles: list[Vehicle], now_ns: int) -> None:
+    def make_requests(requests: CellRequests, vehicles: list[Vehicle], now_ns: int) -> None:
         looked[run] += len(vehicles)
         if run:
-            wishes.make_anew()
-        make(wishes, vehicles, now_ns)
+            requests.make_anew()
+        make(requests, vehicles, now_ns)
 
-    monkeypatch.setattr(CellRequests, "make", make_wishes)
+    monkeypatch.setattr(CellRequests, "make", make_requests)
     simulation_of(name, seed, logs[0], slower=4.0).run_until(SECONDS)  # several ticks a cell
     monkeypatch.setattr(Vehicle, "needs_nothing", property(lambda vehicle: False))
     run = 1
@@ -93,9 +93,9 @@ def told_anew(leader: Leader, table: Table, host: str) -> tuple[dict[str, Held],
         earlier = [each for each in before if each[0][0] == number[0] and each[0][1:] < number[1:]]
         return Entry(number, [(n[1], n[2], of) for n, of in earlier if of != vehicle])
 
-    standing, cols = leader._hosts[host].standing, leader._shards.grid.cols
+    state, cols = leader._hosts[host].state, leader._shards.grid.cols
     steps = [south * cols + east for south in (-1, 0, 1) for east in (-1, 0, 1) if south or east]
-    near = {stand.end + step for stand in (standing.vehicles if standing else ()) for step in steps}
+    near = {stand.end + step for stand in (state.vehicles if state else ()) for step in steps}
     held = {number[0] for _, numbers in every for number in numbers}
     own = {number[0] for numbers in ours.values() for number in numbers}
     each = {vehicle: [entry(number, vehicle) for number in numbers] for vehicle, numbers in ours.items()}

@@ -39,7 +39,7 @@ def set_of(
     epoch: int = 1,
     group: str = "all",
 ) -> MarkSet:
-    """said: cell in the tile -> (kind, pace, stamp); seq counts the author's own sets"""
+    """A set of marks: cell in the tile -> (kind, pace, stamp); `seq` counts the author's own sets."""
     cells = sorted(said)
     seq *= SEQ_STEP
     return mark_set(

@@ -30,6 +30,7 @@ _TOPICS = (
 )  # fmt: skip
 SILENT = MonitorConfig(live=False)
 LIVE = MonitorConfig(live=True, web_port=0)
+READ = "/rerun.sdk_comms.v1alpha1.MessageProxyService/ReadMessages"
 NOBODY, SOMEBODY = Audience(now=0, ever=0), Audience(now=1, ever=1)
 
 
@@ -68,7 +69,7 @@ class Rig(SwarmModel):
         config: MonitorConfig = SILENT,
         audience: Audience = SOMEBODY,
     ) -> None:
-        """audience  who looks; set `self.audience` for those who come and go"""
+        """The audience is who looks; set `self.audience` for those who come and go."""
         self.audience = audience
         super().__init__(terrain=terrain, scenario=scenario, start_ns=0)
         self.speaker = self.bus("speaker")
@@ -100,6 +101,12 @@ class Rig(SwarmModel):
     def close(self) -> None:
         self.service.stop(self.now_ns)
         self.sinks.close()
+
+
+def taking(host: str = "localhost") -> bytes:
+    """A request for the stream of the live view."""
+    head = f"POST {READ} HTTP/1.1\r\nHost: {host}\r\nContent-Type: application/grpc-web+proto\r\n"
+    return head.encode() + b"Content-Length: 5\r\n\r\n" + bytes(5)
 
 
 def say(bus: MemoryBus, terrain: Terrain, message: Message) -> None:

@@ -42,7 +42,7 @@ def cells_of(table: Table | None, vehicle: str) -> list[int]:
     return [*table.grants[vehicle].cells] if vehicle in table.grants else []
 
 
-def standing(
+def host_state(
     host: str, holds: list[Number], seq: int, knows: tuple[int, int] = (0, 0), **more: object
 ) -> HostState:
     cells = [number[0] for number in holds]

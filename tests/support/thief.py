@@ -42,7 +42,7 @@ class Thief(Process):
             elif isinstance(action, Table):
                 self.tell(self.lied_about(action))
             elif isinstance(action, Tell):
-                super().perform([Tell((member,), self.misstated(action.standing)) for member in action.members])
+                super().perform([Tell((member,), self.misstated(action.state)) for member in action.members])
             elif isinstance(action, Left):
                 super().perform([replace(action, entries=[*action.entries, *self.world.entries()][:16])])
             elif isinstance(action, Stored):
@@ -148,15 +148,15 @@ class Thief(Process):
         old = self.chance.choice([*self.past, table])
         return table if old.shard != table.shard else replace(old, epoch=table.epoch, seq=table.seq)
 
-    def misstated(self, standing: HostState) -> HostState:
+    def misstated(self, state: HostState) -> HostState:
         """Another start of it, of which others have ended; or vehicles that hold what others do."""
         if self.chance.random() < 0.3:
-            return replace(standing, generation=standing.generation + self.chance.choice((-1, 1, 1 << 32)))
+            return replace(state, generation=state.generation + self.chance.choice((-1, 1, 1 << 32)))
         if self.chance.random() < 0.3:
-            return replace(standing, dead=[standing.generation, 1], ended=self.chance.random() < 0.5)
-        stolen = [number for number in self.world.entries() if self.world.shards.of(number[0]) == standing.shard]
-        stands = [replace(stand, holds=Held.of([*stand.holds, *stolen][:16])) for stand in standing.vehicles]
-        return replace(standing, vehicles=stands, never=stolen[:8], knows=(1 << 20, 1))
+            return replace(state, dead=[state.generation, 1], ended=self.chance.random() < 0.5)
+        stolen = [number for number in self.world.entries() if self.world.shards.of(number[0]) == state.shard]
+        stands = [replace(stand, holds=Held.of([*stand.holds, *stolen][:16])) for stand in state.vehicles]
+        return replace(state, vehicles=stands, never=stolen[:8], knows=(1 << 20, 1))
 
     def stolen_from(self, table: Table) -> Table:
         """The table, in which a vehicle of one host is given a cell of another."""

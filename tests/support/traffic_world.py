@@ -15,7 +15,7 @@ from swarm.grid import GridSpec
 from swarm.peers import Peer
 from swarm.right_of_way.agent_core import Action, OwnRecord, RightOfWay
 from swarm.right_of_way.agent_session import OwnTime
-from swarm.right_of_way.holdings import Tell, Wish
+from swarm.right_of_way.holdings import CellRequest, Tell
 from swarm.right_of_way.host import AskKnown
 from swarm.right_of_way.shard_member import AskPromises, Refused, Save
 from swarm.right_of_way.shards import Shards
@@ -127,11 +127,9 @@ class Process:
                 case AskPromises():
                     for member in action.members:
                         self.world.claim(self, action, member)
-                case Tell(members, standing):
+                case Tell(members, state):
                     for member in members:
-                        self.world.send(
-                            self, member, lambda to, s=standing: to.rights.hear_host_state(s, to.now_ns)
-                        )
+                        self.world.send(self, member, lambda to, s=state: to.rights.hear_host_state(s, to.now_ns))
                 case Table():
                     for member in self.world.shards.members(action.shard):
                         self.world.send(self, member, lambda to, t=action: to.hear_table(t))
@@ -177,13 +175,13 @@ class Process:
         holdings = self.rights.host
         self.own_time.tick(self.world.now_ns + self.offset_ns)
         self.see_tokens()
-        wishes = {}
+        requests = {}
         if holdings.generation and not holdings.replaced:
             for vehicle in self.vehicles:
                 if holdings.path(vehicle):
                     self.drive(vehicle)
-                    wishes[vehicle] = self.wish(vehicle)
-        self.perform(self.rights.tick(wishes, self.now_ns))
+                    requests[vehicle] = self.request(vehicle)
+        self.perform(self.rights.tick(requests, self.now_ns))
         if holdings.replaced:
             self.world.ended(self)
 
@@ -216,7 +214,7 @@ class Process:
             self.world.moves[vehicle] = self.world.moves.get(vehicle, 0) + 1
             self.world.look()
 
-    def wish(self, vehicle: str) -> Wish:
+    def request(self, vehicle: str) -> CellRequest:
         world = self.world
         path = holdings_path = self.rights.host.path(vehicle)
         goal = world.goals[vehicle]
@@ -237,7 +235,7 @@ class Process:
         if pushed:
             better = len(wants)
         # In steps, so that a statement of changes leaves out vehicles that wait.
-        return Wish(ahead, wants, better, max(self.ages[vehicle] >> 10 << 10, pushed))
+        return CellRequest(ahead, wants, better, max(self.ages[vehicle] >> 10 << 10, pushed))
 
 
 class TrafficWorld:
@@ -401,7 +399,6 @@ class TrafficWorld:
 
     def ask_known(self, source: Process, first: bool = False) -> None:
         """Asks everybody what they know of us, again and again as long as it is needed."""
-
         own = source.disk.own
         request = KnownRequest(agent=source.agent, disk=own.disk, shard_cells=source.rights.shards.side)
 

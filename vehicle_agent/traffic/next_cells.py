@@ -16,7 +16,7 @@ from swarm.clock import NS_PER_S
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec, Window
 from swarm.right_of_way.cell_orders import cells_beside
-from swarm.right_of_way.holdings import Holdings, Wish
+from swarm.right_of_way.holdings import CellRequest, Holdings
 from vehicle_agent.agent_maps import meet
 from vehicle_agent.driving.driven_vehicle import Vehicle
 from vehicle_agent.traffic.obstacles import Obstacles
@@ -37,11 +37,11 @@ _LEAST_GAIN = 0.01
 """Advantage of the route's next cell over staying, at least, in cells."""
 FAR_CELLS = 8
 """A vehicle with no more cells than these ahead requests as many more: half of what a statement has room for."""
-_UNDER_WAY = Wish()
+_UNDER_WAY = CellRequest()
 _BLOCKED_NS = 3 * NS_PER_S
 """A vehicle that has stood for this time on its way asks its planner for another route."""
 _OLDEST_MS = 1 << 31
-"""Above the age of any wish, and within a column of uint32."""
+"""Above the age of any request, and within a column of uint32."""
 
 
 @dataclass
@@ -117,7 +117,7 @@ class Steering:
         first = int(lethal.argmax())
         return first if lethal[first] else len(cells) - 1
 
-    def wish(
+    def request(
         self,
         vehicle: Vehicle,
         path: Sequence[int],
@@ -126,7 +126,7 @@ class Steering:
         held: Container[int],
         in_reach: Callable[[str | None, int], bool],
         lot: int,
-    ) -> Wish:
+    ) -> CellRequest:
         """Returns the request for a vehicle that holds these cells. Depends on nothing but its arguments, on ground
         and obstacles near the vehicle, and on `ways_out`.
 
@@ -140,7 +140,7 @@ class Steering:
         age_ms = max(1, min(age_ms, _OLDEST_MS), pushed_ms)
         if here in self.ways_out:
             wants = sorted(self.steps(here) if still else (), key=held.__contains__)
-            return Wish((), wants, len(wants), age_ms)
+            return CellRequest((), wants, len(wants), age_ms)
         if vehicle.in_reach or vehicle.target is None:
             steps = self.steps(here) if still else []
             flees = still and self.threatened(here)
@@ -156,10 +156,10 @@ class Steering:
                     hash((lot, cell)),
                 ),
             )
-            return Wish((), wants, len(wants) if pushed_ms else 0, pushed_ms)
+            return CellRequest((), wants, len(wants) if pushed_ms else 0, pushed_ms)
         ahead = self._ahead(vehicle, path)
         if not still:
-            return Wish(ahead, (), 0, age_ms) if ahead else _UNDER_WAY
+            return CellRequest(ahead, (), 0, age_ms) if ahead else _UNDER_WAY
         near = self._places(vehicle.route.near(_NEAR_CELLS))
         stays = self._cost(here, near)
         cost, one_way = self._costs(here, stays, near)
@@ -170,14 +170,14 @@ class Steering:
                 cost,
                 key=lambda cell: (self.obstacles.danger(cell), cell in one_way, cost[cell], hash((lot, cell))),
             )
-            return Wish(ahead, wants, len(wants), _OLDEST_MS)
+            return CellRequest(ahead, wants, len(wants), _OLDEST_MS)
         if ahead and ahead[0] in cost and ahead[0] not in one_way:
             # A vehicle on its route requests the next cell even while another holds it: otherwise its request would
             # come a round trip after those of others, once the cell is free.
             cost[ahead[0]] = min(cost[ahead[0]], stays - _LEAST_GAIN)
         wants = sorted(cost, key=lambda cell: (cell in one_way, cost[cell], hash((lot, cell))))
         better = sum(cost[cell] < stays and cell not in one_way for cell in wants)
-        return Wish(ahead, wants, len(wants) if pushed_ms else better, age_ms)
+        return CellRequest(ahead, wants, len(wants) if pushed_ms else better, age_ms)
 
     def threatened(self, cell: int) -> bool:
         """Returns True if an obstacle is on a cell or approaches it: a vehicle there makes way before all
@@ -277,30 +277,30 @@ class Steering:
 
 
 _TURN_NS = 4 * NS_PER_S
-"""A vehicle's wish does not age for this time: then its age grows by a step, in which leaders compare ages.
-Each vehicle's turns begin at another time, so that no tick has all wishes to make
+"""A vehicle's request does not age for this time: then its age grows by a step, in which leaders compare ages.
+Each vehicle's turns begin at another time, so that no tick has all requests to make
 (docs/design/zenoh-topology-and-inboxes.md)."""
 _WAITING_TURN_NS = NS_PER_S
 """The same for one that waits on its way: ties between cells fall another way more often."""
 _MS = NS_PER_S // 1000
 """Unit: ages are sent in milliseconds, clocks count nanoseconds."""
-_STAYS = Wish()
+_STAYS = CellRequest()
 
 
 @dataclass
 class CellRequests:
-    """Makes the wishes of vehicles, and keeps each until one of its inputs changes.
+    """Makes the requests of vehicles, and keeps each until one of its inputs changes.
 
-    `Steering.wish` is a function of its arguments, of the cells near the vehicle (ground, obstacles, and cells held
-    by others) and of nothing else, so a kept wish equals a new one. Its inputs are compared in one place, `make`:
+    `Steering.request` depends on its arguments, on the cells near the vehicle (ground, obstacles, and cells held by
+    others) and on nothing else, so a kept request equals a new one. Its inputs are compared in one place, `make`:
     arguments are compared, and each kind of cell reports its changed cells.
 
-    near_cells   how far from a vehicle the ground may lie on which its wish depends
+    near_cells   how far from a vehicle the ground may lie on which its request depends
     target_cell  the cell of a target, None where it is unknown
     in_reach     whether a target is within capture range of a cell
     seed         decides ties
 
-    of  vehicle -> its wish, as of the last call of `make` or `stay`; the same object while it says the same
+    of  vehicle -> its request, as of the last call of `make` or `stay`; the same object while it says the same
     """
 
     steering: Steering
@@ -309,16 +309,16 @@ class CellRequests:
     target_cell: Callable[[str | None], int | None]
     in_reach: Callable[[str | None, int], bool]
     seed: str
-    of: dict[str, Wish] = field(default_factory=dict)
+    of: dict[str, CellRequest] = field(default_factory=dict)
     _made_of: dict[str, tuple[tuple[object, ...], int, int]] = field(default_factory=dict)
-    """Vehicle -> what its wish was made of, but for the cells near it; and from when until when that is so as far
-    as time has a part in it."""
+    """Vehicle -> the inputs of its request, without the cells near it; and from when until when these hold, as far
+    as time has a part in them."""
     _beside: dict[str, frozenset[int]] = field(default_factory=dict)
     """Vehicle at rest -> the cells that matter if another vehicle holds them."""
     _changed: list[Window] = field(default_factory=list)
-    """Cells whose ground has changed since wishes were made."""
+    """Cells whose ground has changed since requests were made."""
     _held: set[int] = field(default_factory=set)
-    """The cells that vehicles held when wishes were made."""
+    """The cells that vehicles held when requests were made."""
     _since_ns: dict[str, int] = field(default_factory=dict)
     """Vehicle -> since when it has been on its way."""
 
@@ -342,14 +342,14 @@ class CellRequests:
         self._made_of.pop(vehicle, None)
 
     def is_kept(self, vehicle: str, now_ns: int) -> bool:
-        """Returns True if the wish of a vehicle that is under way is good still, as far as ground, obstacles and
+        """Returns True if the request of a vehicle that is under way is good still, as far as ground, obstacles and
         time have a part in it."""
         kept = self._made_of.get(vehicle)
         return kept is not None and kept[1] <= now_ns < kept[2]
 
     def make(self, vehicles: Sequence[Vehicle], now_ns: int) -> None:
-        """Makes the wishes of these vehicles for which anything has changed. Called once in a tick, after all
-        changes of held cells, and after `look_around`. The wishes of others are as they were."""
+        """Makes the requests of these vehicles for which anything has changed. Called once in a tick, after all
+        changes of held cells, and after `look_around`. The requests of others are as they were."""
         holdings, steering = self.holdings, self.steering
         held = holdings.occupied()
         changed = held ^ self._held
@@ -383,12 +383,12 @@ class CellRequests:
                 beside[id] = cells_beside(path[0], self.steering.grid.cols)
                 lot = crc32(f"{self.seed}/{id}/{turn}".encode())
             age_ms = 0 if since_ns is None else max(began_ns - since_ns, 0) // _MS
-            wish = steering.wish(vehicle, path, pushed_ms, age_ms, held, self.in_reach, lot)
-            if wish != self.of.get(id):
-                self.of[id] = wish
+            request = steering.request(vehicle, path, pushed_ms, age_ms, held, self.in_reach, lot)
+            if request != self.of.get(id):
+                self.of[id] = request
 
     def look_around(self, vehicles: Sequence[Vehicle]) -> None:
-        """Keeps no wish of a vehicle near which the ground has changed, or what obstacles close and threaten."""
+        """Keeps no request of a vehicle near which the ground has changed, or what obstacles close and threaten."""
         changed = [*self._changed, *self.steering.obstacles.take_changed()]
         self._changed = []
         if not (changed and vehicles):

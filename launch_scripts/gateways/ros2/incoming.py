@@ -439,7 +439,7 @@ class Incoming:
         return Input(self._node, self._settings.set_pose_of(id), INCOMING["set_pose"], take)
 
     def _goal_input(self, name: str, vehicle: str) -> Input:
-        """name  of the vehicle in ROS"""
+        """The name is that of the vehicle in ROS."""
         orders, row = self._swarm.orders(), INCOMING["vehicle_goal"]
 
         def take(message: Any, _: int) -> None:

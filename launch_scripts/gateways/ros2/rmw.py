@@ -112,7 +112,7 @@ class Endpoint:
 
 
 def dds_name(type_name: str) -> str:
-    """nav_msgs/msg/Path -> nav_msgs::msg::dds_::Path_"""
+    """Returns nav_msgs::msg::dds_::Path_ for nav_msgs/msg/Path."""
     package, kind, base = type_name.split("/")
     return f"{package}::{kind}::dds_::{base}_"
 

@@ -311,7 +311,7 @@ class Input:
 
 
 def open_ros(endpoint: str, timeout_s: float = 10.0) -> zenoh.Session:
-    """A session for a node, such as open_ros("tcp/127.0.0.1:7447"). Raises BusError if no router answers there.
+    """A session for a node, at an endpoint such as tcp/127.0.0.1:7447. Raises BusError if no router answers there.
 
     A client, never a peer: a router of rmw_zenoh does not forward between peers. With timestamps, without which
     latched topics are refused.

@@ -78,7 +78,7 @@ class RosTypes:
         return str(self._store.generate_msgdef(name, ros_version=2)[0])
 
     def make(self, name: str, /, **fields: Any) -> Any:
-        """Returns a message of a type, such as make("geometry_msgs/msg/Point", x=1.0).
+        """Returns a message of a type, such as geometry_msgs/msg/Point with x=1.0.
 
         Missing fields are 0, false or empty. A dict stands for a message which is within.
         """

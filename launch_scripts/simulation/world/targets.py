@@ -140,7 +140,7 @@ class TargetWorld:
         }
 
     def _place(self, id: str, config: TargetConfig, scenario: Scenario, key: str) -> _Target:
-        """key  what names the target's walk"""
+        """The key names the target's walk."""
         chance = random.Random(f"{scenario.seed}/{id}")
         if config.start is None:
             cell = self._terrain.random_home(chance)

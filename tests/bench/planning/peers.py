@@ -126,7 +126,9 @@ def _difference(ours: Costs, theirs: Costs) -> float:
 
 @dataclass(frozen=True)
 class Tool:
-    """grow the whole tree of a root, a flat cell: the part that is measured
+    """A library that is compared.
+
+    grow   grows the whole tree of a root, a flat cell: the part that is measured
     costs  (rows, cols) from each cell to the root, inf where there is no way; None where the tool has no
            comparable costs
     """

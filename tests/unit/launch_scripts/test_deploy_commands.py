@@ -101,14 +101,14 @@ def test_zenohd_admits_the_processes_of_a_scenario_and_needs_certificates(
     certs, out = tmp_path / "certs", tmp_path / "zenohd.json5"
     swarm("deploy certs", certs, "--scenario", scenario)
     files = ("--tls-ca", certs / "ca.pem", "--tls-cert", certs, "--tls-key", certs)
-    told = swarm("deploy zenohd", out, "--listen", "tls/0.0.0.0:7447", *files)
+    told = swarm("deploy zenohd --out", out, "--listen", "tls/0.0.0.0:7447", *files)
     assert told[0] == 2
-    assert swarm("deploy zenohd", out, "--listen", "tls/0.0.0.0:7447", *files, "--scenario", scenario)[0] == 0
+    assert swarm("deploy zenohd --out", out, "--listen", "tls/0.0.0.0:7447", *files, "--scenario", scenario)[0] == 0
     config = json.loads(out.read_text())
     named = {name for each in config["access_control"]["subjects"] for name in each.get("cert_common_names", ())}
     assert named == set(certificate_names(load_scenario(scenario)))
     assert config["transport"]["link"]["tls"]["listen_certificate"] == str(certs / "router.0.pem")
-    assert swarm("deploy zenohd", out, "--force", "--listen", "tcp/127.0.0.1:7447")[0] == 0
+    assert swarm("deploy zenohd --out", out, "--force", "--listen", "tcp/127.0.0.1:7447")[0] == 0
     assert "access_control" not in json.loads(out.read_text())
 
 

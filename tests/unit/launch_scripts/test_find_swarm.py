@@ -187,6 +187,18 @@ def test_a_stopped_launcher_is_shown_so(tmp_path: Path, swarm: Swarm) -> None:
 
 
 @pytest.mark.parametrize(
+    ("entry", "state"),
+    [({}, "starting"), ({"is_whole": True}, "running"), ({"is_whole": True, "is_ending": True}, "ending")],
+)
+def test_a_run_that_ends_or_writes_its_report_is_shown_so(
+    entry: dict[str, bool], state: str, tmp_path: Path, swarm: Swarm
+) -> None:
+    make_run(tmp_path, "r", 9)
+    changed(tmp_path, **entry)
+    assert json.loads(swarm("ps --json")[1])[0]["state"] == state
+
+
+@pytest.mark.parametrize(
     "text",
     ["", "[[[", "[" * 100_000, "\xff", "5", "{}", '{"folder": "/", "pid": 0, "started_s": 0}',
      '{"folder": "/", "pid": -1, "started_s": 0}', '{"folder": ".", "pid": 9, "started_s": 0}'],

@@ -11,6 +11,7 @@ from collections.abc import Iterator
 import numpy as np
 import pytest
 import rerun as rr
+from support.monitor_rig import READ, taking
 from support.processes import eventually
 
 from launch_scripts.monitor.live_layout import make_blueprint
@@ -23,14 +24,7 @@ from swarm.config.scenario import MonitorConfig
 
 pytestmark = pytest.mark.network
 
-READ = "/rerun.sdk_comms.v1alpha1.MessageProxyService/ReadMessages"
 GRPC_WEB = {"Content-Type": "application/grpc-web+proto", "X-Grpc-Web": "1"}
-
-
-def taking(host: str = "localhost") -> bytes:
-    """A request for the stream."""
-    head = f"POST {READ} HTTP/1.1\r\nHost: {host}\r\nContent-Type: application/grpc-web+proto\r\n"
-    return head.encode() + b"Content-Length: 5\r\n\r\n" + bytes(5)
 
 
 @pytest.fixture(scope="module")

@@ -34,7 +34,7 @@ def listed(path: Path) -> list[dict[str, Any]]:
 
 def test_every_set_is_exported_and_inspected_on_the_command_line(tmp_path: Path, swarm: Swarm) -> None:
     store, out = stored(tmp_path / "map.sqlite", SETS), tmp_path / "map.json"
-    assert swarm("marks export", store, out)[0] == 0
+    assert swarm("marks export", store, "--out", out)[0] == 0
     assert [(each["author"], each["tile"], each["seq"], each["marks"]) for each in listed(out)] == [
         ("a1.1", 0, 3 * SEQ_STEP, [[0, 5, "lethal", None, 10], [0, 6, "pace", 2.5, 11]]),
         ("a2.1", 0, SEQ_STEP, [[0, 6, "clear", None, 12]]),
@@ -51,10 +51,10 @@ def test_marks_for_one_class_keep_its_name_in_an_export(tmp_path: Path, swarm: S
     with KeeperStore(store) as kept:
         kept.bind("fedcba9876543210", GRID, ["walker", "truck"])
         kept.save([set_of("a1.1", GRID.tile_for(0, 2), 3, {5: (LETHAL, 0, 10)}), SETS[0]])
-    assert swarm("marks export", store, out)[0] == 0
+    assert swarm("marks export", store, "--out", out)[0] == 0
     assert json.loads(out.read_text())["classes"] == ["walker", "truck"]
     assert [each["tile"] for each in listed(out)] == [0, GRID.tile_for(0, 2)]
-    _, pixels, _ = swarm("marks export", store, tmp_path / "map.tif")
+    _, pixels, _ = swarm("marks export", store, "--out", tmp_path / "map.tif")
     assert "2 marks in 1 set; without 1 mark for one class alone, which .json has" in " ".join(pixels.split())
 
 
@@ -63,7 +63,7 @@ def test_a_geotiff_says_where_and_what(tmp_path: Path, swarm: Swarm) -> None:
 
     store = stored(tmp_path / "map.sqlite", SETS)
     out = tmp_path / "map.tif"
-    assert swarm("marks export", store, out)[0] == 0
+    assert swarm("marks export", store, "--out", out)[0] == 0
     with rasterio.open(out) as tiff:
         assert (tiff.height, tiff.width, tiff.transform.a) == (GRID.rows, GRID.cols, GRID.resolution_m)
         assert np.isinf(tiff.read(1)[0, 5])
@@ -74,9 +74,10 @@ def test_a_geotiff_says_where_and_what(tmp_path: Path, swarm: Swarm) -> None:
 def test_what_cannot_be_read_or_written_is_said_in_a_sentence(tmp_path: Path, swarm: Swarm) -> None:
     store = stored(tmp_path / "map.sqlite", SETS)
     assert (
-        "found the ending '.gpx', expected .json or .tif" in swarm("marks export", store, tmp_path / "map.gpx")[2]
+        "found the ending '.gpx', expected .json or .tif"
+        in swarm("marks export", store, "--out", tmp_path / "map.gpx")[2]
     )
-    assert "cannot write" in swarm("marks export", store, tmp_path / "no" / "map.json")[2]
+    assert "cannot write" in swarm("marks export", store, "--out", tmp_path / "no" / "map.json")[2]
 
 
 def learned_sets(author: str, *said: Measurement) -> list[MarkSet]:
@@ -90,7 +91,7 @@ def test_what_is_learned_is_exported_and_shown_and_counts_as_no_mark(tmp_path: P
         *learned_sets("all.a2.1", Measurement(9, 70_000, 0), Measurement(1, 0, 7)),
     ]
     store, out = stored(tmp_path / "map.sqlite", [*SETS, *words]), tmp_path / "marks.json"
-    told = swarm("marks export", store, out)[1]
+    told = swarm("marks export", store, "--out", out)[1]
     assert told.endswith("3 marks in 3 sets, and learned factors of 2 authors\n")
     assert [each["learned"] for each in listed(out) if each["tile"] == GRID.tiles] == [
         [[0, "unknown 0-5", 400, 72_000, 6_500]],

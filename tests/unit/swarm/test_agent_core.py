@@ -65,7 +65,7 @@ def _through(rights: RightOfWay, ticks: range) -> list[Action]:
         for action in rights.tick({}, tick * S // 10):
             said.append(action)
             if isinstance(action, Tell):
-                rights.hear_host_state(action.standing, tick * S // 10)
+                rights.hear_host_state(action.state, tick * S // 10)
     return said
 
 
@@ -85,7 +85,7 @@ def test_a_replaced_generation_finds_the_shards_that_keep_its_cells_shut_and_say
     assert not older.settled  # the question about it is repeated
     older.hear_known(known)
     (told,) = older.tick({}, S)
-    assert (told.standing.shard, told.standing.ended) == (0, True)
+    assert (told.state.shard, told.state.ended) == (0, True)
 
 
 def test_a_vehicle_that_waits_in_a_shard_without_a_leader_says_so() -> None:

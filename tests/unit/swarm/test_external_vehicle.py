@@ -55,7 +55,7 @@ def entered(cell: int = 70) -> tuple[ExternalVehicle, Leader]:
 def talk(external: ExternalVehicle, leader: Leader, now_ns: int = 0) -> None:
     """Passes messages between the external vehicle and the leader as if they were on file."""
     for action in external.tick(now_ns):
-        leader.take_host_state(action.standing, now_ns)
+        leader.take_host_state(action.state, now_ns)
     table = leader.tick(now_ns)
     if table is not None:
         for granted in leader.granted(table, now_ns):
@@ -206,7 +206,7 @@ def test_an_operator_frees_what_all_generations_of_an_external_vehicle_hold_and_
     for heartbeat in range(1, 6):
         now_ns = heartbeat * 300_000_000
         for told in removal.tick(now_ns):
-            leader.take_host_state(told.standing, now_ns)
+            leader.take_host_state(told.state, now_ns)
         table = leader.tick(now_ns)
         for granted in leader.granted(table, now_ns):
             removal.host.hear_granted(granted, now_ns)

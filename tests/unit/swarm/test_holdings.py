@@ -5,7 +5,7 @@ import pytest
 from support.shard_tables import GRID, MEMBERS, SHARDS, S, entries, granted_of, hear, holdings_of, table_of
 
 from swarm.right_of_way.generations import HEARTBEAT_NS
-from swarm.right_of_way.holdings import Holdings, Wish
+from swarm.right_of_way.holdings import CellRequest, Holdings
 from swarm.wire.messages.traffic import Entry, Left
 from swarm.wire.topics import HOST_STATE
 
@@ -41,11 +41,10 @@ def test_an_entry_given_back_is_not_taken_again_and_another_of_the_same_cell_is(
     hear(holdings, table_of(1, 1, a0=[9]))
     hear(holdings, table_of(1, 2, a0=[9, *entries(1, 2, 10, 11)]))
     holdings.give_back("a0-00")
-    (told,) = holdings.standings({"a0-00": Wish(ahead=[10, 11], wants=[10, 17, 1], better=2)}, S)
-    said = told.standing
-    assert (
-        holdings.standings({"a0-00": Wish(ahead=[10, 11], wants=[10, 17, 1], better=2)}, S + HEARTBEAT_NS - 1) == []
-    )
+    requests = [{"a0-00": CellRequest(ahead=[10, 11], wants=[10, 17, 1], better=2)} for _ in range(2)]
+    (told,) = holdings.host_states(requests[0], S)
+    said = told.state
+    assert holdings.host_states(requests[1], S + HEARTBEAT_NS - 1) == []
     assert ([*said.vehicles[0].holds], said.vehicles[0].ahead) == ([(9, 1, 1)], [10, 11])
     hear(holdings, table_of(1, 3, a0=[9, *entries(1, 2, 10, 11)]))  # it has not heard that yet
     assert list(holdings.path("a0-00")) == [9]
@@ -57,24 +56,24 @@ def test_a_host_gives_back_what_another_waits_for_far_ahead_and_says_so_at_once(
     holdings.keeps = 2
     cells = [8, 9, 10, 11, 12, 13, 14]
     hear(holdings, table_of(1, 1, a0=cells))
-    wish = {"a0-00": Wish()}
-    holdings.standings(wish, S)
+    request = {"a0-00": CellRequest()}
+    holdings.host_states(request, S)
     for seq, followed, left in ((2, 10, cells), (3, 13, cells[:5])):
         table = granted_of(table_of(1, seq, a0=cells))
         holdings.hear_granted(msgspec.structs.replace(table, followed={"a1": [(followed, 1, 1)]}), S)
         assert holdings.path("a0-00") == left
     assert [word.entries for word in holdings.lefts(S)] == [[(13, 1, 1)]]
-    (told,) = holdings.standings(wish, S)
-    assert [*told.standing.vehicles[0].holds] == [(cell, 1, 1) for cell in cells[:5]]
+    (told,) = holdings.host_states(request, S)
+    assert [*told.state.vehicles[0].holds] == [(cell, 1, 1) for cell in cells[:5]]
 
 
 def test_to_have_driven_on_is_no_news_until_another_waits_or_little_is_left(holdings: Holdings) -> None:
     holdings.keeps = 2
-    cells, wish = [8, 9, 10, 11, 12, 13, 14], {"a0-00": Wish()}
+    cells, request = [8, 9, 10, 11, 12, 13, 14], {"a0-00": CellRequest()}
     hear(holdings, table_of(1, 1, a0=cells))
 
     def held_by_word() -> list[int]:
-        return [cell for told in holdings.standings(wish, S) for cell in told.standing.vehicles[0].holds.cells]
+        return [cell for told in holdings.host_states(request, S) for cell in told.state.vehicles[0].holds.cells]
 
     assert held_by_word() == cells
     holdings.moved("a0-00", 10)
@@ -128,18 +127,18 @@ def test_the_older_of_two_generations_learns_that_it_is_replaced(holdings: Holdi
     assert list(holdings.path("a0-00")) == []
     hear(holdings, table_of(1, 3, a0=[9]), S)  # late: it places no vehicle
     assert list(holdings.path("a0-00")) == []
-    assert all(told.standing.ended for told in holdings.standings({}, S))
+    assert all(told.state.ended for told in holdings.host_states({}, S))
 
 
 def test_a_host_speaks_to_the_leader_that_it_hears_and_else_to_all_members(holdings: Holdings) -> None:
-    assert [told.members for told in holdings.standings({}, S)] == [MEMBERS]
+    assert [told.members for told in holdings.host_states({}, S)] == [MEMBERS]
     hear(holdings, table_of(1, 1, a0=[9]), 2 * S)
-    assert [told.members for told in holdings.standings({}, 2 * S)] == [(SHARDS.leader(0, 1),)]
+    assert [told.members for told in holdings.host_states({}, 2 * S)] == [(SHARDS.leader(0, 1),)]
     hear(holdings, table_of(1, 1, a0=[9]), 3 * S)  # told again
-    assert [told.members for told in holdings.standings({}, 3 * S)] == [(SHARDS.leader(0, 1),)]
-    assert [told.members for told in holdings.standings({}, 4 * S)] == [MEMBERS]
+    assert [told.members for told in holdings.host_states({}, 3 * S)] == [(SHARDS.leader(0, 1),)]
+    assert [told.members for told in holdings.host_states({}, 4 * S)] == [MEMBERS]
     hear(holdings, table_of(0, 9, a0=[9]), 5 * S)  # of one that was replaced
-    assert [told.members for told in holdings.standings({}, 5 * S)] == [MEMBERS]
+    assert [told.members for told in holdings.host_states({}, 5 * S)] == [MEMBERS]
 
 
 @pytest.mark.parametrize("lie", [[0, -8], [-8], [56, 64], [1 << 31]])

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
-from support.shard_tables import GRID, SHARDS, S, cells_of, entries, holdings_of, standing, table_of
+from support.shard_tables import GRID, SHARDS, S, cells_of, entries, holdings_of, host_state, table_of
 
 from swarm.right_of_way.cell_orders import Orders
 from swarm.right_of_way.generations import HEARTBEAT_NS, first_generation, is_far_ahead
@@ -18,12 +18,12 @@ from swarm.wire.messages.traffic import Held, Stand
 def test_a_cell_is_free_again_only_by_the_word_of_its_host() -> None:
     leader = Leader(SHARDS, "a0", 3, table_of(1, 1, a1=[9, 10, (11, 1, 2)]), {"a1": ["a1-00"]})
     assert cells_of(leader.tick(0), "a1-00") == [9, 10, 11]
-    leader.take_host_state(standing("a1", entries(1, 1, 10), seq=2, knows=(1, 1)), 0)
+    leader.take_host_state(host_state("a1", entries(1, 1, 10), seq=2, knows=(1, 1)), 0)
     assert cells_of(leader.tick(S), "a1-00") == [10, 11]
-    leader.take_host_state(standing("a1", entries(1, 1, 9, 10), seq=1), 0)  # late
-    leader.take_host_state(standing("a1", entries(1, 1, 10), seq=3, knows=(1, 1)), 0)  # of before the last grant
+    leader.take_host_state(host_state("a1", entries(1, 1, 9, 10), seq=1), 0)  # late
+    leader.take_host_state(host_state("a1", entries(1, 1, 10), seq=3, knows=(1, 1)), 0)  # of before the last grant
     assert cells_of(leader.tick(2 * S), "a1-00") == [10, 11]
-    leader.take_host_state(standing("a1", entries(1, 1, 10), seq=4, knows=(1, 2)), 0)
+    leader.take_host_state(host_state("a1", entries(1, 1, 10), seq=4, knows=(1, 2)), 0)
     assert cells_of(leader.tick(3 * S), "a1-00") == [10]
 
 
@@ -43,9 +43,12 @@ def test_a_table_adds_one_entry_to_a_cell_at_most_so_that_its_number_is_used_onc
 
 def test_entries_of_an_older_generation_stay_until_it_has_stopped_or_is_proved_dead() -> None:
     nine = entries(1, 1, 9)
-    for end in (standing("a1", nine, seq=9, ended=True), standing("a1", nine, seq=9, generation=1 << 33, dead=[1])):
+    for end in (
+        host_state("a1", nine, seq=9, ended=True),
+        host_state("a1", nine, seq=9, generation=1 << 33, dead=[1]),
+    ):
         leader = Leader(SHARDS, "a0", 3, table_of(1, 1, a1=[9, 10]), {"a1": ["a1-00"]})
-        leader.take_host_state(standing("a1", nine, seq=1, generation=1 << 32, vehicles=[]), 0)
+        leader.take_host_state(host_state("a1", nine, seq=1, generation=1 << 32, vehicles=[]), 0)
         table = leader.tick(0)
         assert [(each.agent, each.generation, each.entries) for each in table.fences] == [
             ("a1", 1, {"a1-00": Held.of(entries(1, 1, 9, 10))})
@@ -60,7 +63,7 @@ def test_the_entry_of_a_body_passes_to_the_generation_that_proves_the_older_one_
         leader = Leader(SHARDS, "a0", 3, table_of(1, 1, rover=[9, 10]), {"a1": ["a1-00"]})
         stands = Stand("rover-00", 10, 10, Held(), [10], [], 0, 0)
         leader.take_host_state(
-            standing("rover", [(10, 0, 0)], 1, generation=1 << 32, dead=dead, vehicles=[stands]), 0
+            host_state("rover", [(10, 0, 0)], 1, generation=1 << 32, dead=dead, vehicles=[stands]), 0
         )
         table = leader.tick(0)
         assert [*table.grants.get("rover-00", [])] == cells
@@ -71,7 +74,7 @@ def test_an_older_generation_is_told_that_it_is_replaced_by_a_leader_that_never_
     table = table_of(1, 1, a1=[9])
     table.hosts["a1"] = (2 << 32, 7)
     leader = Leader(SHARDS, "a0", 3, table, {"a1": ["a1-00"]})
-    for late in (standing("a1", [(9, 1, 1)], seq=50), standing("a1", [(9, 1, 1)], seq=51, ended=True)):
+    for late in (host_state("a1", [(9, 1, 1)], seq=50), host_state("a1", [(9, 1, 1)], seq=51, ended=True)):
         leader.take_host_state(late, S)
         told = leader.tick(S)
         (granted,) = leader.granted(table if told is None else told, S)
@@ -84,7 +87,7 @@ def test_an_older_generation_is_told_that_it_is_replaced_by_a_leader_that_never_
 
 def test_a_generation_that_is_implausibly_far_ahead_is_refused_and_named() -> None:
     leader = Leader(SHARDS, "a0", 3, table_of(1, 1, a1=[9]), {"a1": ["a1-00"]})
-    leader.take_host_state(standing("a1", [(9, 1, 1)], seq=1, generation=1 << 61), 0)
+    leader.take_host_state(host_state("a1", [(9, 1, 1)], seq=1, generation=1 << 61), 0)
     assert "a1 names a generation" in leader.refused[0]
     assert leader.tick(0).hosts["a1"] == (1, 1)  # type: ignore[union-attr]
     assert first_generation(5 << 32 | 7, 1) > 5 << 32 | 0xFFFF_FFFF
@@ -100,7 +103,7 @@ def test_among_vehicles_of_one_age_each_goes_first_at_times() -> None:
         leader = Leader(SHARDS, "a0", 3, held, {host: [f"{host}-00"] for host in places})
         for host, cell in places.items():
             stand = Stand(f"{host}-00", cell, cell, Held.of([(cell, 1, 1)]), [27], [27], 1, step << 12)
-            leader.take_host_state(standing(host, [(cell, 1, 1)], seq=2, vehicles=[stand]), 0)
+            leader.take_host_state(host_state(host, [(cell, 1, 1)], seq=2, vehicles=[stand]), 0)
         table = leader.tick(0)
         first.update(vehicle for vehicle in table.grants if 27 in cells_of(table, vehicle))
     assert first == set(held.grants)
@@ -111,7 +114,7 @@ def plan(stands: dict[str, Stand]) -> dict[str, list[int]]:
     held = table_of(1, 1, **{host: list(stand.holds) for host, stand in stands.items()})
     leader = Leader(SHARDS, "a0", 3, held, {host: [f"{host}-00"] for host in stands})
     for host, stand in stands.items():
-        leader.take_host_state(standing(host, list(stand.holds), seq=2, vehicles=[stand]), 0)
+        leader.take_host_state(host_state(host, list(stand.holds), seq=2, vehicles=[stand]), 0)
     table = leader.tick(0)
     return {vehicle: cells_of(table, vehicle) for vehicle in table.grants}
 
@@ -162,18 +165,18 @@ def test_no_two_exchange_places_and_none_go_around_in_a_ring() -> None:
 
 def test_what_has_not_changed_is_told_again_under_the_same_stamp_once_in_a_heartbeat() -> None:
     leader = Leader(SHARDS, "a0", 3, table_of(1, 1, a1=[9, 10]), {"a1": ["a1-00"]})
-    leader.take_host_state(standing("a1", entries(1, 1, 9, 10), seq=1), 0)
+    leader.take_host_state(host_state("a1", entries(1, 1, 9, 10), seq=1), 0)
     first = leader.tick(0)
     assert first is not None
-    leader.take_host_state(standing("a1", entries(1, 1, 9, 10), seq=2), 0)
+    leader.take_host_state(host_state("a1", entries(1, 1, 9, 10), seq=2), 0)
     assert leader.tick(HEARTBEAT_NS // 2) is None
     assert leader.tick(HEARTBEAT_NS) is first
-    leader.take_host_state(standing("a1", entries(1, 1, 10), seq=3, knows=(1, 1)), HEARTBEAT_NS)
+    leader.take_host_state(host_state("a1", entries(1, 1, 10), seq=3, knows=(1, 1)), HEARTBEAT_NS)
     assert leader.tick(HEARTBEAT_NS + 1) is None  # a mere release can wait
     freed = leader.tick(2 * HEARTBEAT_NS)
     assert (freed.seq, freed.hosts["a1"], cells_of(freed, "a1-00")) == (2, (1, 3), [10])
     leader.take_host_state(
-        standing("a1", entries(1, 1, 10), seq=4, vehicles=[]), 2 * HEARTBEAT_NS
+        host_state("a1", entries(1, 1, 10), seq=4, vehicles=[]), 2 * HEARTBEAT_NS
     )  # it wants nothing here any more
     assert leader.tick(3 * HEARTBEAT_NS).hosts["a1"] == (1, 4)  # type: ignore[union-attr]
 
@@ -200,7 +203,7 @@ def test_a_round_of_planning_sends_no_two_to_one_cell_and_lets_the_oldest_throug
         assert to == mover.cell or to in mover.wants
         if to != mover.cell and to in at:
             assert round.to[at[to]] != mover.cell  # no two vehicles exchange places
-    # If any cell is free, the oldest gets its first wish: all others can be pushed along.
+    # If any cell is free, the oldest gets its first choice: all others can be pushed along.
     if movers[0].better and count < GRID.cells // 2:
         assert round.to["v0"] == movers[0].wants[0]
 

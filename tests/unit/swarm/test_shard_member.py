@@ -2,7 +2,7 @@
 
 import msgspec
 from msgspec.structs import replace
-from support.shard_tables import MEMBERS, SHARDS, S, near_members, standing, table_of
+from support.shard_tables import MEMBERS, SHARDS, S, host_state, near_members, table_of
 
 from swarm.right_of_way.generations import HEARTBEAT_NS
 from swarm.right_of_way.shard_member import Member, Refused, Save
@@ -44,10 +44,10 @@ def test_the_second_member_says_what_the_first_has_not_said_and_something_in_eac
 def leader_that_told(fleets: dict[str, list[str]]) -> tuple[Member, Table]:
     """A member that has just become leader, and the table that it sent, which no member has stored yet."""
     member = Member(SHARDS, MEMBERS[0], 0, table_of(0, 0, a0=[9]), fleets, 0, near_members())
-    member.hear_host_state(standing("a0", [(9, 0, 1)], seq=1), 2 * S)
+    member.hear_host_state(host_state("a0", [(9, 0, 1)], seq=1), 2 * S)
     claim = member.tick(2 * S)[0]
     member.hear_promise(MEMBERS[1], claim.promised, table_of(0, 0), 2 * S)
-    member.hear_host_state(standing("a0", [(9, 0, 1)], seq=2), 2 * S)
+    member.hear_host_state(host_state("a0", [(9, 0, 1)], seq=2), 2 * S)
     (_, table) = member.tick(2 * S)
     assert isinstance(table, Table)
     return member, table
@@ -63,14 +63,14 @@ def test_members_that_answer_are_told_what_has_changed_since_the_table_that_all_
         ((None, table.seq), table),
     ):
         now_ns += HEARTBEAT_NS
-        member.hear_host_state(standing("a0", [(9, 0, 1)], seq=now_ns), now_ns)
+        member.hear_host_state(host_state("a0", [(9, 0, 1)], seq=now_ns), now_ns)
         for other, seq in zip(MEMBERS[1:], stored, strict=True):
             if seq is not None:
                 member.hear_stored(Stored(shard=0, agent=other, epoch=table.epoch, seq=seq), now_ns)
         told = table if base is None else table.changes(base)
         assert [each for each in member.tick(now_ns) if not isinstance(each, Granted)] == [told]
     now_ns += 2 * HEARTBEAT_NS
-    member.hear_host_state(standing("a0", [(9, 0, 1)], seq=now_ns), now_ns)
+    member.hear_host_state(host_state("a0", [(9, 0, 1)], seq=now_ns), now_ns)
     assert member.tick(now_ns) == [table]  # no member has answered
 
 
@@ -116,14 +116,14 @@ def test_changes_make_no_table_that_is_larger_than_a_message_may_be() -> None:
 
 def test_an_epoch_has_one_leader_only_though_a_promise_comes_twice() -> None:
     member = member_of()
-    member.hear_host_state(standing("a1", [(9, 0, 1)], seq=1), 2 * S)
+    member.hear_host_state(host_state("a1", [(9, 0, 1)], seq=1), 2 * S)
     save = member.tick(2 * S)[0]
     member.hear_promise("a stranger", save.promised, table_of(0, 0), 2 * S)
     assert member.leader is None
     member.hear_promise(MEMBERS[1], save.promised, table_of(0, 0), 2 * S)
     first = member.leader
     assert first is not None
-    member.hear_host_state(standing("a1", [(9, 0, 1)], seq=3), 3 * S)
+    member.hear_host_state(host_state("a1", [(9, 0, 1)], seq=3), 3 * S)
     member.tick(3 * S)  # no member has acknowledged anything: it resigns
     assert member.leader is None
     member.hear_promise(MEMBERS[1], save.promised, table_of(0, 0), 3 * S)
@@ -141,11 +141,11 @@ def test_an_epoch_that_is_implausibly_far_ahead_is_refused_and_named() -> None:
 def test_what_a_table_grants_is_told_once_two_of_three_members_have_stored_it() -> None:
     fleets = {"a0": ["a0-00"], "a1": ["a1-00"]}
     member = Member(SHARDS, MEMBERS[0], 0, table_of(0, 0, a0=[9], a1=[18]), fleets, 0, near_members())
-    member.hear_host_state(standing("a0", [(9, 0, 1)], seq=1), 2 * S)
+    member.hear_host_state(host_state("a0", [(9, 0, 1)], seq=1), 2 * S)
     claim = member.tick(2 * S)[0]
     member.hear_promise(MEMBERS[1], claim.promised, table_of(0, 0), 2 * S)
     wants = [Stand("a0-00", 9, 9, Held.of([(9, 0, 1)]), [], [18, 10], 2, 0)]
-    member.hear_host_state(standing("a0", [(9, 0, 1)], seq=2, vehicles=wants), 2 * S)
+    member.hear_host_state(host_state("a0", [(9, 0, 1)], seq=2, vehicles=wants), 2 * S)
     (_, table) = member.tick(2 * S)
     stored = Stored(shard=0, agent=MEMBERS[1], epoch=table.epoch, seq=table.seq)
     for too_old in (msgspec.structs.replace(stored, seq=0), msgspec.structs.replace(stored, epoch=0)):

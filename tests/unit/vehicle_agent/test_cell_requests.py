@@ -1,4 +1,4 @@
-"""A wish is kept until something that it was made of changes, and no longer."""
+"""A request is kept until something that it was made of changes, and no longer."""
 
 import random
 from collections.abc import Callable
@@ -9,7 +9,7 @@ import pytest
 from swarm.clock import NS_PER_S
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec, Window
-from swarm.right_of_way.holdings import Wish
+from swarm.right_of_way.holdings import CellRequest
 from swarm.wire.messages.vehicles import Obstacle
 from vehicle_agent.driving.driven_vehicle import GivenRoute, Vehicle
 from vehicle_agent.traffic.next_cells import FAR_CELLS, CellRequests, Steering
@@ -33,7 +33,7 @@ class Held:
 
 
 class Place:
-    """A few vehicles on a small map; each call of `change` changes one thing of which wishes are made."""
+    """A few vehicles on a small map; each call of `change` changes one thing of which requests are made."""
 
     def __init__(self, seed: int) -> None:
         self.chance = random.Random(seed)
@@ -44,7 +44,7 @@ class Place:
         self.obstacles.tick(self.now_ns)
         self.steering = Steering(GRID, self.pace, PlannerConfig(), RESERVE, self.obstacles)
         self.target = GRID.cell(12, 12)
-        self.wishes = CellRequests(
+        self.requests = CellRequests(
             self.steering,
             self.held,  # type: ignore[arg-type]
             2 * FAR_CELLS + 2,
@@ -89,7 +89,7 @@ class Place:
         row = min(max(row + self.chance.randint(-3, 3), 0), GRID.rows - 1)
         col = min(max(col + self.chance.randint(-3, 3), 0), GRID.cols - 1)
         self.pace[row, col] = self.chance.choice((0.1, np.inf, 0.4))
-        self.wishes.ground_changed([Window(row, col, row + 1, col + 1)])
+        self.requests.ground_changed([Window(row, col, row + 1, col + 1)])
 
     def obstacle(self) -> None:
         x_m, y_m = GRID.centre_m(self.chance.choice(self.vehicles).cell)
@@ -121,7 +121,7 @@ class Place:
     def zone(self) -> None:
         cells = [vehicle.cell for vehicle in self.vehicles[: self.chance.randrange(3)]]
         self.steering.ways_out = dict.fromkeys(cells, 2)
-        self.wishes.make_anew()
+        self.requests.make_anew()
 
     def wait(self) -> None:
         self.now_ns += TICK_NS
@@ -136,31 +136,31 @@ class Place:
 @pytest.mark.parametrize("seed", range(6))
 def test_whatever_changes_the_wishes_that_are_kept_are_those_that_would_be_made_again(seed):
     place = Place(seed)
-    wishes, kept = place.wishes, 0
+    requests, kept = place.requests, 0
     for _ in range(300):
-        before = dict(wishes._made_of)
+        before = dict(requests._made_of)
         place.chance.choice(place.changes)()
-        wishes.look_around(place.vehicles)
-        wishes.make(place.vehicles, place.now_ns)
-        kept += sum(before.get(id) is made_of for id, made_of in wishes._made_of.items())
-        told = dict(wishes.of)
-        wishes.make_anew()
-        wishes.make(place.vehicles, place.now_ns)
-        assert wishes.of == told
-        assert all(wishes.of[id] is wish for id, wish in told.items())
+        requests.look_around(place.vehicles)
+        requests.make(place.vehicles, place.now_ns)
+        kept += sum(before.get(id) is made_of for id, made_of in requests._made_of.items())
+        told = dict(requests.of)
+        requests.make_anew()
+        requests.make(place.vehicles, place.now_ns)
+        assert requests.of == told
+        assert all(requests.of[id] is request for id, request in told.items())
     assert kept > 1500
 
 
 def test_one_that_stands_or_leaves_leaves_nothing_behind():
     place = Place(1)
-    wishes = place.wishes
-    wishes.make(place.vehicles, place.now_ns)
+    requests = place.requests
+    requests.make(place.vehicles, place.now_ns)
     first, *others = place.vehicles
-    wishes.stay(first.id)
-    assert wishes.of[first.id] == Wish()
-    wishes.make(place.vehicles, place.now_ns)
-    assert wishes.of[first.id] != Wish()
+    requests.stay(first.id)
+    assert requests.of[first.id] == CellRequest()
+    requests.make(place.vehicles, place.now_ns)
+    assert requests.of[first.id] != CellRequest()
     for vehicle in place.vehicles:
-        wishes.forget(vehicle.id)
-    assert not any((wishes.of, wishes._made_of, wishes._beside, wishes._since_ns))
+        requests.forget(vehicle.id)
+    assert not any((requests.of, requests._made_of, requests._beside, requests._since_ns))
     assert others

@@ -161,12 +161,14 @@ def test_who_comes_to_rest_on_its_route_goes_on_however_that_winds(seed: int, re
     cells = walk(GRID, start, route.directions)
     vehicle.route.begin(cells, [start])
     for here, after in pairwise(cells):
-        wish = steering.wish(vehicle, [here], 0, 1, (), lambda *_: False, seed)
-        assert wish.better > 0
-        assert wish.ahead[0] == after
-        assert wish.wants[0] == after or climb is None  # there another cell may be as good
+        asked = steering.request(vehicle, [here], 0, 1, (), lambda *_: False, seed)
+        assert asked.better > 0
+        assert asked.ahead[0] == after
+        assert asked.wants[0] == after or climb is None  # there another cell may be as good
         # A vehicle in the way is pushed on, or passed; to stay is no answer.
-        assert after in steering.wish(vehicle, [here], 0, 1, {after}, lambda *_: False, seed).wants[: wish.better]
+        assert (
+            after in steering.request(vehicle, [here], 0, 1, {after}, lambda *_: False, seed).wants[: asked.better]
+        )
         vehicle.route.moved(after)
 
 
@@ -178,7 +180,7 @@ def test_who_must_make_way_goes_last_where_it_could_not_come_back_from(seed: int
     steering, here = steering_on(climb), int(rng.integers(GRID.cells))
     vehicle = Vehicle("v", GRID, here)
     vehicle.target, vehicle.in_reach = "t", near
-    wants = steering.wish(vehicle, [here], 1, 1, (), lambda *_: near, seed).wants
+    wants = steering.request(vehicle, [here], 1, 1, (), lambda *_: near, seed).wants
     back = [climb.allows(each, here) for each in wants]
     assert sorted(wants) == sorted(steering.steps(here))
     assert back == sorted(back, reverse=True)
@@ -188,7 +190,7 @@ def test_who_makes_way_in_reach_of_its_target_stays_in_reach_where_it_can():
     here, reached = 3 * GRID.cols + 3, {19, 20, 28}
     vehicle = Vehicle("v", GRID, here)
     vehicle.target, vehicle.in_reach = "t", True
-    wants = steering_on(None).wish(vehicle, [here], 1, 1, (), lambda _, cell: cell in reached, 0).wants
+    wants = steering_on(None).request(vehicle, [here], 1, 1, (), lambda _, cell: cell in reached, 0).wants
     assert len(wants) == 8
     assert set(wants[:3]) == reached
 

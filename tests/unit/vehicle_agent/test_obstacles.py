@@ -16,7 +16,7 @@ from swarm.config.scenario import PlannerConfig
 from swarm.config.scenario_files import parse_scenario
 from swarm.errors import ConfigError
 from swarm.grid import GridSpec
-from swarm.right_of_way.holdings import Wish
+from swarm.right_of_way.holdings import CellRequest
 from swarm.wire.messages.planning import TargetPose
 from swarm.wire.messages.vehicles import Obstacle
 from vehicle_agent.driving.driven_vehicle import GivenRoute, Vehicle
@@ -256,14 +256,14 @@ def test_a_vehicle_at_rest_makes_way_for_an_obstacle_that_comes(obstacles: Obsta
     obstacles.take_report(obstacle(20.5, 10.5, radius_m=2.0, heading_rad=math.pi / 2, speed_m_per_s=20.0), NOW)
     obstacles.tick(NOW)
 
-    def wish_at(cell: int) -> Wish:
+    def request_at(cell: int) -> CellRequest:
         vehicle = Vehicle("a0-00", GRID, cell)
-        return steering(obstacles, pace).wish(vehicle, [cell], 0, 0, (), lambda target, cell: False, 1)
+        return steering(obstacles, pace).request(vehicle, [cell], 0, 0, (), lambda target, cell: False, 1)
 
-    wish = wish_at(GRID.cell(20, 13))
-    assert wish.better == len(wish.wants) == 8
-    assert all(row != 20 for row, _ in (divmod(cell, 40) for cell in wish.wants[:2]))
-    assert wish_at(GRID.cell(25, 13)).better == 0
+    request = request_at(GRID.cell(20, 13))
+    assert request.better == len(request.wants) == 8
+    assert all(row != 20 for row, _ in (divmod(cell, 40) for cell in request.wants[:2]))
+    assert request_at(GRID.cell(25, 13)).better == 0
 
 
 # --- targets as obstacles ---
