@@ -194,12 +194,13 @@ class Lied(SwarmModel):
         self.services = {**getattr(self, "services", {}), f"{role}-{id}": service}
         return service
 
-    def disturb(self, step: int) -> None:
-        """Disturbs the processes while they receive lies."""
-        if self.state == "cut" and step in (4, 12):
+    def disturb(self, step: int, steps: int) -> None:
+        """Disturbs the processes while they receive lies, in the middle third of the steps."""
+        begins, ends = step == steps // 3, step == 2 * steps // 3
+        if self.state == "cut" and (begins or ends):
             for node in ("agent-a0", f"planner-{self.target}"):
-                (self.cut if step == 4 else self.heal)(self.buses[node])
-        if self.state == "restarted" and step == 6:
+                (self.cut if begins else self.heal)(self.buses[node])
+        if self.state == "restarted" and step == steps // 2:
             for role, id in (("planner", self.target), ("agent", "a0"), ("keeper", "0")):
                 self.kill(f"{role}-{id}")
                 self.begin(role, id, 2)
@@ -260,7 +261,7 @@ def lied_to(
             liar.ask(topic, liar.hear)
         if step % 5 == 0 and may is None:
             liar.token(swarm.chance.choice(ROLES))
-        swarm.disturb(step)
+        swarm.disturb(step, steps)
         swarm.run(0.1)
     liar.serving = False
     liar.bus.close()
