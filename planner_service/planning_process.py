@@ -1,7 +1,7 @@
 """The set-up that all processes which plan routes share: the network, who leads, orders, the map of each class.
 
-The cell costs of a map are shared by its planners on one machine, in a file of the run's folder. To compute them
-takes less time than to check a digest of them, so each planner does, and keeps the file in place of its own.
+The cell costs of a map are shared by its planners on one machine, in a file of the run's folder. Each planner
+computes them, which takes less time than a digest, and uses the file in place of its own if the two are equal.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ def shared_costs(folder: Path | None, terrain: Terrain, config: PlannerConfig) -
             found: Floats = NO_COSTS
             with contextlib.suppress(OSError, ValueError):
                 found = open_array(path)
-            if not np.array_equal(found, own.time_cost):
+            if found.dtype != own.time_cost.dtype or not np.array_equal(found, own.time_cost):
                 log.info("writing the cell costs of this map to %s", path)
                 save_array(path, own.time_cost)
                 found = open_array(path)

@@ -7,6 +7,7 @@ import ctypes
 import functools
 import hashlib
 from pathlib import Path
+from tokenize import TokenError
 from typing import Any, Literal
 
 import numpy as np
@@ -39,7 +40,10 @@ def open_array(path: Path) -> NDArray[Any]:
     file = path.open("rb")
     major, _ = np.lib.format.read_magic(file)
     read = np.lib.format.read_array_header_1_0 if major == 1 else np.lib.format.read_array_header_2_0
-    shape, in_columns, dtype = read(file)
+    try:
+        shape, in_columns, dtype = read(file)
+    except (SyntaxError, TokenError) as error:
+        raise ValueError(f"header of an array: {error}") from error
     if dtype.hasobject or in_columns:
         raise ValueError(f"array of {dtype}" if dtype.hasobject else "array in columns")
     return np.asarray(_map(file, dtype, shape, file.tell(), "r"))

@@ -126,7 +126,7 @@ def _state(path: Path) -> _State | None:
 
 
 class Lock:
-    """The locked file beside a store, which holds its witness. It is made again if it is deleted.
+    """The locked file beside a store, which holds its witness. It is made again if it is deleted or replaced.
 
     The lock ends with its process.
 
@@ -150,11 +150,17 @@ class Lock:
         return file
 
     def witness(self, seal: Seal) -> None:
-        if not Path(f"{self._path}.lock").exists():
-            file, self._file = self._file, self._locked(waits=False)
-            os.close(file)
+        if not self._is_there():
+            with suppress(StoreError):  # another process has it, and finds the store locked or changed
+                file, self._file = self._file, self._locked(waits=False)
+                os.close(file)
         with writing(self._path):
             os.pwrite(self._file, seal.packed(), 0)
+
+    def _is_there(self) -> bool:
+        with suppress(OSError):
+            return os.path.samestat(os.stat(f"{self._path}.lock"), os.fstat(self._file))
+        return False
 
     def close(self) -> None:
         if self._file >= 0:

@@ -2,9 +2,9 @@
 
 If no cell was offered less, a cell of another piece is the source of a better offer only if its own piece's total
 has risen by more than that one's. A tile is therefore checked where one of its pieces has risen by more than
-another of them, or than one of a tile beside it which it *meets*: the two have cells beside each other. The
-state of a tile is one number, the largest amount by which all changes since its check may lower an offer to a cell
-(`Tiles.falls`).
+another piece of the tile, or than a piece of another tile which it *meets*: the two have cells beside each other.
+The state of a tile is one number, the largest amount by which all changes since its check may lower an offer to a
+cell (`Tiles.falls`).
 
 A piece that loses its path keeps its last cost, and once it has a path again its change is reckoned from that: a
 branch behind a closed path mostly comes back as it was, at a higher cost, and is then checked along its edge only.
@@ -326,7 +326,7 @@ def begin(tiles, schedule):
 
 @kernel(GRID, tile_pieces.TREE, tile_pieces.TILES, tile_pieces.SCRATCH, tile_pieces.SCHEDULE)
 def add_up(grid, tree, tiles, scratch, schedule):
-    """Evaluates totals, and note where they have risen."""
+    """Evaluates totals, and notes where they have risen."""
     begin(tiles, schedule)
     evaluate_totals(grid, tree, tiles, scratch.border, schedule, schedule.now)
     queue_checks(tree, tiles, schedule)

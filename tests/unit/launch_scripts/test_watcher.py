@@ -25,7 +25,7 @@ from swarm.runtime.stats import VIEWERS
 from swarm.wire.messages.orders import Order, Orders
 from swarm.wire.messages.processes import Alarm, Note, Stats
 from swarm.wire.messages.vehicles import Fleet, Followed
-from swarm.wire.topics import FLEET, FOLLOWED, NOTE, ORDERS, POSE, STATS, STATUS
+from swarm.wire.topics import FLEET, FOLLOWED, NOTE, ORDERS, POSE, STATS, STATUS, TOPICS
 
 
 def begun() -> tuple[SwarmModel, Watcher, list[object]]:
@@ -185,6 +185,7 @@ def test_an_alarm_is_opened_only_by_a_launcher_that_hears_what_closes_it(records
     part.speak()
     latest = part.known.observed
     for word, kind in KINDS.items():
+        assert kind.opened_by <= {topic.name for topic in TOPICS}, word
         if kind.opened_by <= {topic.name for topic in latest.hears}:
             assert kind.opened_by <= set(part.deliveries()), word
     alarms = alarms_of(latest, ("t0", "t1", "t2"), part.swarm.now_ns)

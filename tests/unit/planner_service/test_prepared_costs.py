@@ -1,5 +1,6 @@
 """Data that the planners of a machine share: the same as each would compute, and never another map's."""
 
+from io import BytesIO
 from pathlib import Path
 
 import numpy as np
@@ -76,15 +77,19 @@ def test_costs_of_another_terrain_are_never_taken(tmp_path: Path) -> None:
     np.testing.assert_array_equal(other, ground.cell_cost)
 
 
-@pytest.mark.parametrize("damage", ["cut", "a bit", "empty", "no array"])
+@pytest.mark.parametrize("damage", ["cut", "a bit", "a bit of the header", "wider", "empty", "no array"])
 def test_damaged_files_are_written_again(tmp_path: Path, damage: str) -> None:
     terrain = mapped(tmp_path)
     shared_costs(tmp_path, terrain, CONFIG)
     path = tmp_path / COSTS
     whole, expected = path.read_bytes(), np.load(path)
+    wider = BytesIO()
+    np.save(wider, expected.astype(np.float64))
     damaged = {
         "cut": whole[:-100],
         "a bit": whole[:-1000] + bytes([whole[-1000] ^ 4]) + whole[-999:],
+        "a bit of the header": whole.replace(b"'descr'", b"%descr'"),
+        "wider": wider.getvalue(),
         "empty": b"",
         "no array": b"costs",
     }

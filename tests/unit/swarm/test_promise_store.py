@@ -68,6 +68,8 @@ def test_promises_go_on_and_stay_locked_whatever_is_moved_or_deleted(tmp_path: P
             shutil.rmtree(path.parent)
         elif seq == at and gone != "nothing":
             (path.parent / gone).unlink()
+            with pytest.raises(StoreError, match="is in use by the same agent"):
+                FilePromiseStore(path)  # it makes another lock file
     store.sync()
     assert (path.parent / "promises-a0.lock").read_bytes() == path.read_bytes()[:SEAL_BYTES]
     with pytest.raises(StoreError, match="is in use by the same agent"):
