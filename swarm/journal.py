@@ -150,17 +150,12 @@ class Lock:
         return file
 
     def witness(self, seal: Seal) -> None:
-        if not self._is_there():
+        if not _is_at(Path(f"{self._path}.lock"), self._file):
             with suppress(StoreError):  # another process has it, and finds the store locked or changed
                 file, self._file = self._file, self._locked(waits=False)
                 os.close(file)
         with writing(self._path):
             os.pwrite(self._file, seal.packed(), 0)
-
-    def _is_there(self) -> bool:
-        with suppress(OSError):
-            return os.path.samestat(os.stat(f"{self._path}.lock"), os.fstat(self._file))
-        return False
 
     def close(self) -> None:
         if self._file >= 0:
@@ -174,6 +169,13 @@ def _lock(path: Path, file: int, in_use: str, *, waits: bool) -> None:
         fcntl.flock(file, fcntl.LOCK_EX | (0 if waits else fcntl.LOCK_NB))
     except OSError as error:
         raise StoreError(f"{path} is in use {in_use}") from error
+
+
+def _is_at(path: Path, file: int) -> bool:
+    """Returns True if an open file is still the one of this name."""
+    with suppress(OSError):
+        return os.path.samestat(path.stat(), os.fstat(file))
+    return False
 
 
 def witness_of(path: Path, kind: str) -> Seal | None:
@@ -280,9 +282,8 @@ class Journal:
 
     def _reserve(self) -> str | None:
         if self._spare >= 0:
-            with suppress(OSError):
-                if os.path.samestat(self._spare_path.stat(), os.fstat(self._spare)):
-                    return None
+            if _is_at(self._spare_path, self._spare):
+                return None
             os.close(self._spare)  # it has been deleted, or moved away
             self._spare = -1
         size = max(self._least, 4 * (SEAL_BYTES + sum(_RECORD.size + len(body) for body in self._live())))

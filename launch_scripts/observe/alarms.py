@@ -145,6 +145,7 @@ def alarms_of(latest: LatestState, targets: Iterable[str], now_ns: int) -> tuple
     def place(cell: int | None) -> tuple[int | None, int | None]:
         return (None, None) if cell is None or not 0 <= cell < latest.grid.cells else latest.grid.row_col(cell)
 
+    heard = {topic.name for topic in latest.hears}
     alarms = [
         Alarm(
             plain(told.kind),
@@ -160,7 +161,7 @@ def alarms_of(latest: LatestState, targets: Iterable[str], now_ns: int) -> tuple
             is_old=now_ns - heard_ns > _OLD_NS,
         )
         for told, heard_ns in found
-        if kind_of(told.kind).opened_by <= {topic.name for topic in latest.hears}
+        if kind_of(told.kind).opened_by <= heard
     ]
     lasting = sorted((a for a in alarms if a.lasts), key=lambda a: (not a.serious, a.since_s or 0.0, a.about))
     over = sorted((a for a in alarms if not a.lasts), key=lambda a: (-(a.over_s or 0.0), a.kind, a.about))
