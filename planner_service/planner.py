@@ -42,8 +42,7 @@ MOST_PULLED_STEPS = MOST_STEPS >> 3
 """The same of routes that are pulled, which cross twice as many cells at most and may have a leg for each step."""
 GOOD_GAP = 1.05
 """Under a strategy that goes by proofs, nothing is grown for a route asked for by force that is proven to be this
-good already: four of five such growths gave back the route that was there
-(docs/design/zenoh-topology-and-inboxes.md)."""
+good already: four of five such growths gave back the route that was there."""
 
 
 @dataclass(frozen=True, slots=True)

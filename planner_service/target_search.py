@@ -43,7 +43,7 @@ KEPT_SHARE = 0.3
 """A place is given up when no more than this share of the belief around it is left (docs/design/search.md)."""
 IDLE_S = 300.0
 """A place at which nothing is believed is given only to a vehicle that can reach no other. It is given up after so
-long: by then there may be one (docs/design/search.md)."""
+long: by then there may be one."""
 STEP_S = 30.0
 """Longest step of the belief; shorter if blocks are small."""
 MOST_GOALS = 4096
@@ -412,8 +412,7 @@ UNSEEN_NS = 2 * NS_PER_S
 """A target in sight is published twice a second: one that is not published for this time, though a vehicle is at
 its position, is not there (docs/design/search.md)."""
 LOST_NS = 30 * NS_PER_S
-"""A target whose tracker is lost is searched for after this time: most trackers are back by then
-(docs/design/search.md)."""
+"""A target whose tracker is lost is searched for after this time: most trackers are back by then."""
 LISTEN_NS = 5 * NS_PER_S
 """A planner that has just begun listens for this time before it takes its target for never seen
 (docs/design/search.md)."""

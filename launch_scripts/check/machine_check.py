@@ -48,7 +48,7 @@ _CELL_BYTES = 30
 """Bytes of the terrain, which all processes share, and of its file in the folder of a run."""
 _RECORDING_BYTES_PER_MINUTE = 20 << 20
 """A rule of thumb on the safe side: a thousand vehicles were recorded with 9 MB a minute, and with 24 before routes
-were drawn as trees (docs/design/live-view.md)."""
+were drawn as trees."""
 _MOST_BYTES = 1 << 60
 """An exbibyte, above what any time that a scenario may name (`MOST_SECONDS`) comes to: the number stays within 64
 bits."""

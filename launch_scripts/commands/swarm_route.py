@@ -35,7 +35,7 @@ M = TypeVar("M", bound=Message)
 
 _TIMEOUT_S = 5.0
 """A planner answers within 1 s, or says that it has no tree; five times that is for a busy machine, as for plans of
-ROS (docs/design/ros2-gateway.md)."""
+ROS."""
 
 
 _PLACE = "place"

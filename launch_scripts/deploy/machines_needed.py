@@ -29,8 +29,7 @@ from swarm.config.scenario import Scenario, plan_agents
 from swarm.errors import ConfigError
 
 USED_SHARE = 0.6
-"""Usable share of the cores and the memory of a machine, and of one core by a process: beyond it work waits
-(docs/design/zenoh-topology-and-inboxes.md)."""
+"""Usable share of the cores and the memory of a machine, and of one core by a process: beyond it work waits."""
 LINK_SHARE = 0.5
 """Usable share of a link's capacity."""
 OVERHEAD_BYTES = 100

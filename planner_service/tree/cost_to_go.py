@@ -37,8 +37,7 @@ NO_WINDOW: WindowBound = (np.empty(0, np.float32), (0, 0, 0, 0), np.empty(0, np.
 
 MOST_SPREAD_SHARE = 48
 """In a repair, a fall in cost spreads over at most 1/48 of the cells: a spread costs ten times an evaluation. If
-more cells change, whole branches have moved, and their trees are evaluated first
-(docs/design/incremental-trees.md)."""
+more cells change, whole branches have moved, and their trees are evaluated first."""
 
 
 class CostToGoTree:

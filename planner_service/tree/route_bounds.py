@@ -16,8 +16,7 @@ from shared_map.array_files import Floats
 from swarm.wire.route_columns import RouteBatch
 
 LOWER_SHARE = 16
-"""A heuristic is lowered by visiting at most one cell in this number; beyond, the bound waits for a full search
-(docs/design/certified-gap.md)."""
+"""A heuristic is lowered by visiting at most one cell in this number; beyond, the bound waits for a full search."""
 
 
 class LowerBounds:

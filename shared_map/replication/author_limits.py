@@ -19,7 +19,7 @@ _PART = 4
 
 _MAX_WAITING = 1 << 14
 """Sets of throttled processes that wait, in all. Sets without a place are requested again once a digest names them
-(docs/design/map-merge-law.md)."""
+(docs/reference/limits.md)."""
 
 _TURNS = 128
 """Turns of waiting processes in one tick, some 10 ms: names cost a sender nothing."""

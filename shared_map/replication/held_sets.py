@@ -19,8 +19,7 @@ from swarm.wire.messages.map_data import DIGEST_ROW, DIGEST_ROW_BYTES, MarkSet, 
 
 REMEMBERED_NS = 600 * NS_PER_S
 """A set which arrives later than this after its tombstone is held again. No digest of a keeper names it, so it is
-offered to the keepers, which remember tombstones for much longer and send this one again
-(docs/design/anti-entropy-and-compaction.md)."""
+offered to the keepers, which remember tombstones for much longer and send this one again."""
 _MAX_TOMBSTONES = 1 << 16
 """Some 23 MB. In `REMEMBERED_NS` a hundred sets a second may be deleted before any is forgotten early."""
 

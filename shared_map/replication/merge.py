@@ -212,8 +212,7 @@ _CLEAR = int(MarkKind.CLEAR)
 _PACE = int(MarkKind.PACE)
 _AREA_BITS = TILE_AREA.bit_length() - 1
 _FEW = 128
-"""Up to this number of marks, before and after together, lists are faster than arrays
-(docs/design/map-merge-law.md)."""
+"""Up to this number of marks, before and after together, lists are faster than arrays."""
 _NOTHING = (_CLEAR, 0.0, NO_STATEMENT)
 _TYPES = (np.uint32, np.uint8, np.float32, np.int64)
 """Types of the columns of `NewWinners`."""

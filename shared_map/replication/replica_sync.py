@@ -37,8 +37,7 @@ _JOIN_TRIES = 5
 _JOIN_RETRY_NS = NS_PER_S // 2
 """After the first try, and twice as long after each: 7.5 s in all, in which the others of a swarm have started."""
 _ASK_AGAIN_NS = NS_PER_S * 15 // 100
-"""A question whose answer is lost on a network that loses 30 % is repeated so soon
-(docs/design/map-merge-law.md)."""
+"""A question whose answer is lost on a network that loses 30 % is repeated so soon."""
 _MAX_ASKS = 16
 """Limit of authors that are asked together: the most that a false digest with thousands of rows can start."""
 _CHANGES_EVERY_NS = NS_PER_S // 2
@@ -65,8 +64,7 @@ _MANY = "-"
 _MAX_NAMES = 4096
 """Authors of whom is remembered when they spoke or were warned of: names cost a sender nothing."""
 _WARN_AGAIN_NS = 60 * NS_PER_S
-"""An author is named once a minute (docs/design/map-merge-law.md): one that floods must not fill the log as
-well."""
+"""An author is named once a minute: one that floods must not fill the log as well."""
 
 
 class MapSync:

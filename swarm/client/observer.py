@@ -24,7 +24,7 @@ EVERY_S = 0.2
 _HEARD = (FLEET, OBSTACLE, POSE, FOLLOWED, NOTE, MARKS)
 _MARKS_TAG = "observer-marks"
 _MOST_SETS = 1 << 16
-"""Sets of marks that are held: a quarter of what a replica may hold (docs/design/map-merge-law.md)."""
+"""Sets of marks that are held: a quarter of what a replica may hold (docs/reference/limits.md)."""
 _ZONES = "operator."
 """Authors with this prefix write zones."""
 

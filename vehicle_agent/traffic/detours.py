@@ -25,7 +25,7 @@ _LOOK_CELLS = 200
 _CELLS_PER_TICK = 400
 """Expanded by all searches of a host: some 4 ms (docs/design/reported-obstacles.md)."""
 _MOST_CELLS = 20_000
-"""Expanded by one search: then there is no path around that is worth it (docs/design/reported-obstacles.md)."""
+"""Expanded by one search: then there is no path around that is worth it."""
 _AGAIN_NS = NS_PER_S
 _RARELY_NS = 16 * NS_PER_S
 """A vehicle without a path around is tried again after one second, then after twice as long, up to this."""

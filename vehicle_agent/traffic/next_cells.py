@@ -278,8 +278,7 @@ class Steering:
 
 _TURN_NS = 4 * NS_PER_S
 """A vehicle's request does not age for this time: then its age grows by a step, in which leaders compare ages.
-Each vehicle's turns begin at another time, so that no tick has all requests to make
-(docs/design/zenoh-topology-and-inboxes.md)."""
+Each vehicle's turns begin at another time, so that no tick has all requests to make."""
 _WAITING_TURN_NS = NS_PER_S
 """The same for one that waits on its way: ties between cells fall another way more often."""
 _MS = NS_PER_S // 1000

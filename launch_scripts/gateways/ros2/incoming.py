@@ -287,8 +287,7 @@ and each of them is a copy of the map on the network."""
 _MOST_NEWS = 1 << 14
 """Endpoints that come or go between two ticks: 64 of each of `MOST_ROBOTS`, when all robots start together."""
 _MOST_ORDERS = 8
-"""Orders of which one is being obeyed, which takes seconds, while the rest wait; more are refused at once
-(docs/design/ros2-gateway.md)."""
+"""Orders of which one is being obeyed, which takes seconds, while the rest wait; more are refused at once."""
 _TRACKER = "ros2"
 """Name of the tracker that the gateway is: its next start takes its targets over at once."""
 

@@ -34,8 +34,8 @@ _AGAIN_S = 2.0
 _MOST_SEEN = 4096
 """Peers' endpoints that wait to be looked at; the oldest are dropped first."""
 _POSITIONS_S = 0.1
-"""Ten samples a second, as often as vehicles tell where they are by default (docs/design/ros2-gateway.md): a
-position is a tenth of a second old at most."""
+"""Ten samples a second, as often as vehicles tell where they are by default: a position is a
+tenth of a second old at most."""
 
 
 def serve(

@@ -25,11 +25,9 @@ from swarm.wire.messages.vehicles import Fleet, Obstacle
 from swarm.wire.topics import COST, FLEET, OBSTACLE, POSE, STATUS, TRUE_POSE, Topic
 
 _MOVED_CELLS = 0.25
-"""A share of a cell, which trackers of others are asked for, too (docs/design/zenoh-topology-and-inboxes.md,
-docs/vehicle/tracker.md)."""
+"""A share of a cell, which trackers of others are asked for, too (docs/vehicle/tracker.md)."""
 _AGAIN_NS = NS_PER_S // 2
-"""Interval at which a target at rest is published (docs/design/zenoh-topology-and-inboxes.md): four times within
-the lease of a pose, 2 s."""
+"""Interval at which a target at rest is published: four times within the lease of a pose, 2 s."""
 
 
 class PoseThrottle:
