@@ -14,6 +14,7 @@ from docs.generate import scenario_page, wire_page
 from docs.generate.__main__ import command_line
 from launch_scripts import cli
 from launch_scripts.typer_commands import Family
+from swarm.config.explain import meanings
 from swarm.config.scenario import Scenario
 from swarm.wire.topics import TOPICS
 
@@ -100,12 +101,13 @@ def test_every_command_and_option_of_the_command_line_is_on_the_page():
 def test_every_key_message_and_field_is_on_the_page():
     page = wire_page.document()
     for topic in TOPICS:
-        assert f"| `{topic.key}` |" in page
+        assert f"- `{topic.key}` " in page
         for message in filter(None, (topic.message, topic.request)):
-            assert f"### {message.__name__}\n" in page
-            assert f'"{message.__struct_config__.tag}"' in page
+            section = page.partition(f"\n### {message.__name__}\n")[2].partition("\n### ")[0]
+            assert f'"{message.__struct_config__.tag}"' in section
             for field in message.__struct_fields__:
-                assert re.search(rf"^    {field} +\S", page, re.MULTILINE)
+                assert re.search(rf"^    (\w+, )*{field}(, \w+)*  +\S", section, re.MULTILINE)
+            assert meanings(message).keys() <= set(message.__struct_fields__)
 
 
 _FILE = re.compile(r"`((?:[\w.-]+/)+[\w-]+\.(?:py|toml|md|sh|yml|json))`")
