@@ -39,8 +39,8 @@ def document() -> str:
     first = {part: message for message in reversed(messages()) for part in parts(message)}
     return filled(
         "wire", first=first, topics=TOPICS, messages=messages(), enums=(MarkKind, VehicleState, RouteStatus),
-        version=WIRE_VERSION, alive_key=ALIVE_KEY, operator=OPERATOR, members=MEMBERS.split(), bus=bus, codec=codec, grid=grid,
-        link=_link, granted=_granted, schemas=_schemas, struct=_struct, parts=parts, told=_told(),
+        version=WIRE_VERSION, alive_key=ALIVE_KEY, operator=OPERATOR, members=MEMBERS.split(), bus=bus, codec=codec,
+        grid=grid, link=_link, granted=_granted, schemas=_schemas, struct=_struct, parts=parts, told=_told(),
     )  # fmt: skip
 
 
@@ -59,7 +59,7 @@ def json_document() -> str:
 
 
 def _granted(grants: tuple[Grant, ...]) -> str:
-    """The roles of an act, each with the fields of the key that must be its own; operators if there are no others."""
+    """The roles that may do an act, each with the fields of the key that must be its own."""
     named = (":".join(filter(None, (of.role, ",".join(of.own)))) for of in grants if of.role != OPERATOR)
     words = " ".join(named) or OPERATOR
     return words.replace(MEMBERS_OWN, "members:role,id").replace(MEMBERS, "members").replace(" ", ", ")
@@ -84,7 +84,8 @@ def _schemas(message: type[Message]) -> str:
 
 
 def _struct(struct: type[msgspec.Struct]) -> str:
-    """Returns the prose of a struct, and its fields: those of a map which have one type and meaning share a line."""
+    """Returns the prose of a struct and its fields. Those of one type and meaning share a line, except in an
+    array."""
     told, is_array = meanings(struct), struct.__struct_config__.array_like
     fields: dict[tuple[str, ...], list[str]] = {}
     for name, *rest in rows(struct):

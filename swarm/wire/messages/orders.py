@@ -135,7 +135,7 @@ class Order(fields.Bounded, frozen=True, kw_only=True):
 
     name      of the vehicle, group, target or setting
     stamp_ns  of two orders about one subject the later counts
-    off       taken back: a pause ends, a vehicle goes, a target is removed, a group or setting is as in the scenario
+    off       taken back: a pause ends, a vehicle goes, a target is removed, group or setting are as in the scenario
     targets   of a group; all if empty
     value     of a setting
     cell      place of a target

@@ -338,8 +338,8 @@ class Claim(Message, frozen=True, kw_only=True, tag=schema_of("claim")):
 
 
 class KnownRequest(Message, frozen=True, kw_only=True, tag=schema_of("known-request")):
-    """A new generation of an agent or an external vehicle asks all agents what they know of it. An agent is answered
-    only by those whose shards are as large as its own.
+    """A new generation of an agent or an external vehicle asks all agents what they know of it. Agents with shards
+    of another size do not answer an agent.
 
     disk   its file; 0 of an external vehicle, and not noted
     layer  0 ground, 1 air: only agents of this layer answer
