@@ -36,7 +36,7 @@ class ZoneOrder(Message, frozen=True, kw_only=True, tag=schema_of("zone-order"))
     polygon        corners [row, col]; [0, 0] is the north-west corner of the terrain
     polygon_m      corners [x_m, y_m] instead, as in poses
     corners        corners as places instead
-    lasts_s        time until the zone ends; None: without end
+    lasts_s        time until the zone ends, above 0 and at most 1e9; None: without end
     vehicle_class  None: for all classes
     stamp_ns       as in `GiveOrder`
     holes          parts of `polygon` outside the zone, as corners [row, col]

@@ -121,7 +121,7 @@ class HostState(Message, frozen=True, kw_only=True, tag=schema_of("host-state", 
     replaces the older.
 
     generation  of the host; a later one is greater
-    knows       number of the newest table that the host has used. It has left or given back every entry which that
+    knows       stamp of the newest table that the host has used. It has left or given back every entry which that
                 table, or an older one, added and which is not listed in `vehicles`
     dead        earlier generations that have certainly ended: they had locked the host's file, which this one has
                 locked now
