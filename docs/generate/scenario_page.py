@@ -102,13 +102,12 @@ def _sections(root: Section) -> list[tuple[str, Section]]:
 
 
 def _rows(path: str, section: Section) -> Iterator[tuple[str, ...]]:
-    """Yields key, meaning, allowed values and default of each setting."""
+    """Yields key, allowed values, default and meaning of each setting."""
     hints, said = hints_of(section), _meanings(section)
     for field in msgspec.structs.fields(section):
         key = field.encode_name
         if path or section_in(hints[key]) is None:
-            cells = (f"`{key}`", said[key], _allowed(hints[key]), _default(field))
-            yield tuple(cell.replace("|", "\\|") for cell in cells)
+            yield key, _allowed(hints[key]), _default(field), said[key]
 
 
 def _meanings(section: Section) -> dict[str, str]:
@@ -137,7 +136,7 @@ def _allowed(hint: Any) -> str:
                 [*(f"`{name}`" for name in note.extra["built_in"]), "a [plug-in](../plugins/index.md)"]
             )
     if section_in(hint) is not None:
-        return "tables, see below" if is_several(hint) else "a table, see below"
+        return "tables, below" if is_several(hint) else "a table, below"
     if typing.get_origin(kind) is tuple:
         return words.replace("a list", f"a list of {_allowed(args[0])}")
     if typing.get_origin(kind) is dict and args[1] is not Any:
@@ -147,12 +146,10 @@ def _allowed(hint: Any) -> str:
 
 def _default(field: msgspec.structs.FieldInfo) -> str:
     if field.required:
-        return "must be given"
+        return "required"
     value = field.default if field.default is not msgspec.NODEFAULT else field.default_factory()
-    if value is None:
+    if value is None or isinstance(value, msgspec.Struct):
         return ""
-    if isinstance(value, msgspec.Struct):
-        return "see below"
     if isinstance(value, tuple) and any(isinstance(item, msgspec.Struct) for item in value):
         return "one, with its defaults"
     return f"`{json.dumps(msgspec.to_builtins(value))}`"

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import inspect
-import itertools
 import json
 import re
-import textwrap
 import types
 import typing
 from pathlib import Path
@@ -14,12 +12,14 @@ from typing import Annotated, Any
 
 import msgspec
 
+from docs.generate.scenario_page import prose
 from docs.generate.templates import filled
 from launch_scripts.process_table import ROLES as STARTED_ROLES
 from swarm import grid
 from swarm.bus import bus
+from swarm.config.explain import meanings
 from swarm.wire import codec, topics
-from swarm.wire.access import MEMBERS, OPERATOR, Grant
+from swarm.wire.access import MEMBERS, MEMBERS_OWN, OPERATOR, Grant
 from swarm.wire.fields import Characters, Column, taken_apart
 from swarm.wire.messages import WIRE_VERSION, Message
 from swarm.wire.messages.map_data import SEQ_STEP, MarkKind
@@ -39,8 +39,8 @@ def document() -> str:
     first = {part: message for message in reversed(messages()) for part in parts(message)}
     return filled(
         "wire", first=first, topics=TOPICS, messages=messages(), enums=(MarkKind, VehicleState, RouteStatus),
-        version=WIRE_VERSION, alive_key=ALIVE_KEY, operator=OPERATOR, bus=bus, codec=codec, grid=grid, how=_how,
-        link=_link, granted=_granted, schemas=_schemas, struct=_struct, parts=parts, told=_told(),
+        version=WIRE_VERSION, alive_key=ALIVE_KEY, operator=OPERATOR, members=MEMBERS.split(), bus=bus, codec=codec,
+        grid=grid, link=_link, granted=_granted, schemas=_schemas, struct=_struct, parts=parts, told=_told(),
     )  # fmt: skip
 
 
@@ -59,22 +59,10 @@ def json_document() -> str:
 
 
 def _granted(grants: tuple[Grant, ...]) -> str:
-    """The roles of a cell without operators, of which the page says once what they may do."""
-    groups = itertools.groupby((of for of in grants if of.role != OPERATOR), key=lambda of: of.own)
-    named = (", ".join(of.role for of in some) + f" ({', '.join(own)})" * bool(own) for own, some in groups)
-    return "; ".join(named).replace(MEMBERS.replace(" ", ", "), "every member")
-
-
-def _how(topic: Topic) -> str:
-    ways = []
-    if topic.published:
-        ways.append("put" if topic.newest else f"put, {topic.buffer} kept")
-    if topic.request is not None:
-        several = f", {_link(topic.bulk)} where asked for" if topic.bulk is not None else ""
-        ways.append(f"get {_link(topic.request)}{several}")
-    if topic.free:
-        ways.append(f"free: {', '.join(topic.free)}")
-    return "; ".join(ways)
+    """The roles that may do an act, each with the fields of the key that must be its own."""
+    named = (":".join(filter(None, (of.role, ",".join(of.own)))) for of in grants if of.role != OPERATOR)
+    words = " ".join(named) or OPERATOR
+    return words.replace(MEMBERS_OWN, "members:role,id").replace(MEMBERS, "members").replace(" ", ", ")
 
 
 def _link(message: type[Message]) -> str:
@@ -96,9 +84,13 @@ def _schemas(message: type[Message]) -> str:
 
 
 def _struct(struct: type[msgspec.Struct]) -> str:
-    prose, _, listing = inspect.cleandoc(struct.__doc__ or "").partition("\n\n")
-    listing = textwrap.indent(listing, "    ")
-    return filled("struct", about=prose, listing=listing, rows=rows(struct), required=REQUIRED)
+    """Returns the prose of a struct and its fields. Those of one type and meaning share a line, except in an
+    array."""
+    told, is_array = meanings(struct), struct.__struct_config__.array_like
+    fields: dict[tuple[str, ...], list[str]] = {}
+    for name, *rest in rows(struct):
+        fields.setdefault((*rest, told.get(name, ""), name if is_array else ""), []).append(name)
+    return filled("struct", about=prose(struct), fields=fields, is_array=is_array, required=REQUIRED)
 
 
 def rows(struct: type[msgspec.Struct]) -> list[list[str]]:

@@ -98,7 +98,7 @@ def status(
 ) -> None:
     """Show a running swarm: metrics, processes, targets and alarms.
 
-    Without --connect it asks the newest active run of this machine, whatever its ports.
+    Without --connect it asks the newest active run of this machine.
 
     swarm status
 
@@ -107,7 +107,7 @@ def status(
     swarm status --vehicles | grep stranded
 
     watch     Show processes once a second, as `swarm top`.
-    vehicles  Show each vehicle instead: its class, its state, where it drives to, and its place.
+    vehicles  Show each vehicle instead: class, state, destination and place.
     """
     from launch_scripts.commands.status_view import ask_status, print_status, status_fields, vehicles_table
     from launch_scripts.launcher.console import whole_output
@@ -135,14 +135,14 @@ def top(
 ) -> None:
     """Watch a running swarm, once a second; Ctrl-C ends it.
 
-    Processes on other machines are shown, too, from their own reports. CPU of 100 % is one core; late/s counts
-    ticks that came late or not at all; a role shows its worst process.
+    Processes on other machines are included. CPU of 100 % is one core; late/s counts ticks that came late or not at
+    all; a role shows its worst process.
 
     swarm top --each
 
     swarm top --json --once | jq .processes[0]
 
-    each     Print a line for each process, not only for each role.
+    each     Print a line for each process, not for each role.
     once     Show it once and end.
     as_json  Print one JSON object a second, or one with --once.
     """
@@ -161,7 +161,7 @@ def health(url: Annotated[str, typer.Option()], live: bool = False, as_json: sha
 
     swarm health --url http://127.0.0.1:9464 --live
 
-    url   Where metrics or health are served, such as http://127.0.0.1:9464.
+    url   Where metrics or health are served.
     live  Check that processes are alive, not that they are ready.
     """
     from launch_scripts.web.health_probe import ask
@@ -185,7 +185,7 @@ def metrics(
 
     swarm metrics --alerts > swarm-alerts.yml
 
-    `swarm up --metrics-port 9464` does the same for as long as the run lasts.
+    `swarm up --metrics-port 9464` does the same during a run.
 
     port       Port to listen at; 0 picks one.
     dashboard  Print a dashboard for Grafana, as JSON, and exit.

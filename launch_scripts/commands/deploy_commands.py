@@ -59,15 +59,15 @@ def plan(
 
     Then, on each machine NAME with its archive: tar xzf NAME.tar.gz && sudo swarm-NAME/install
 
-    An archive holds service, scenario and certificates. Every process runs once. Two keepers, or a process and its
-    standby, never share a machine. A second plan into the same folder renews certificates that end soon, and
-    removes archives of other machines.
+    An archive has service, scenario and certificates. Two keepers, or a process and its standby, never share a
+    machine. A second plan into the same folder renews certificates that end soon, and removes archives of other
+    machines.
 
     hosts  The machines, in TOML: see docs/operate/machines.md.
-    out    Write an archive for each machine here, certificates included; if not given, only print the plan.
+    out    Write an archive for each machine here. Default: only print the plan.
     kit    Service manager of the processes: systemd, or compose (containers).
-    image  Image of the roles, NAME:TAG, for containers; if not given, that of this version.
-    wheel  Put this wheel of the swarm into the archives, to be installed from them.
+    image  Image of the roles, NAME:TAG, for containers. Default: that of this version.
+    wheel  Wheel of the swarm, which is installed from the archives.
     days   Days until new certificates expire.
     """
     from launch_scripts.check.scenario_check import check_start  # `revoke` does not wait for it
@@ -146,10 +146,10 @@ def size(
 
     swarm deploy size --vehicles 10000 --targets 100 --cores 32 --memory 128 --link 10000
 
-    Machines are used to 60 % of cores and memory, and links to half. Beyond the measured
-    swarms the table is extrapolated; docs/design/measurement.md has it and its errors.
+    Machines are used to 60 % of cores and memory, and links to half. Beyond the measured swarms
+    (docs/design/measurement.md) the table is extrapolated.
 
-    Exit code 1 if a process has to do more than one core can: more machines do not help it.
+    Exit code 1 if a process needs more than one core, which more machines cannot give.
 
     vehicles   Vehicles.
     targets    Targets, each with a planner.
@@ -207,12 +207,12 @@ def certs(
 
     swarm deploy certs certs --scenario my.toml router.0=10.0.0.1,base.local
 
-    This makes one per process of the scenario, named ROLE.ID, or agent.GROUP.ID: the router lets each do what its
-    name allows. docs/operate/access.md says which files go where. ca.key stays here: its holder can admit any
-    process. Existing certificates are kept while more than a third of their validity is left.
+    This makes one per process of the scenario, named ROLE.ID, or agent.GROUP.ID, with the rights of that name
+    (docs/operate/access.md). ca.key stays here: its holder can admit any process. Existing certificates are kept
+    while more than a third of their validity is left.
 
     folder    Folder of the authority and of all certificates.
-    names     Names to make certificates for. A router needs the hosts that others connect to.
+    names     Names of certificates. A router needs the hosts that others connect to.
     scenario  Also make the certificates of its processes that are missing, expire soon or are revoked.
     days      Days until they expire.
     renew     Replace existing certificates of the names given.
@@ -243,9 +243,9 @@ def revoke(folder: Path, names: list[str]) -> None:
 
     swarm deploy revoke certs agent.all.a0
 
-    This adds the names to the file `revoked` in the folder. Then, on each machine with a router, do the same or
-    copy the file. All links drop and return at once; revoked names return without rights. `swarm deploy certs
-    --renew` makes the next certificate of a name.
+    This adds the names to the file `revoked` in the folder. Do the same on each machine with a router, or copy the
+    file. All links drop and return at once, those of revoked names without rights. `swarm deploy certs --renew`
+    makes the next certificate of a name.
 
     folder  Folder with the certificate of a router.
     names   Names as in the certificates: agent.all.a0~2.

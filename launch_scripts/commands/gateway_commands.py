@@ -29,9 +29,9 @@ _MOST_ALTITUDE_M = 10_000.0
 class RosSide:
     """Connection to the ROS side.
 
-    ros           Router of the ROS side, rmw_zenohd; tcp/127.0.0.1:7447 if not given.
-    domain        ROS_DOMAIN_ID; 0 if not given.
-    distribution  humble, jazzy, kilted, lyrical or rolling; jazzy if not given.
+    ros           Router of the ROS side, rmw_zenohd. Default: tcp/127.0.0.1:7447.
+    domain        ROS_DOMAIN_ID. Default: 0.
+    distribution  humble, jazzy, kilted, lyrical or rolling. Default: jazzy.
     """
 
     panel: ClassVar[str | None] = "The ROS side"
@@ -49,7 +49,7 @@ def ros2(
 ) -> None:
     """Publish a running swarm to ROS 2 (rmw_zenoh), until Ctrl-C.
 
-    It publishes map, transforms, odometry, plans, targets and markers. ROS need not be installed here.
+    ROS need not be installed here.
 
     swarm gateway ros2 --ros tcp/127.0.0.1:7447
 
@@ -92,7 +92,7 @@ def _join(network: NetworkConfig) -> Swarm:
 class Drives:
     """Control of a vehicle.
 
-    target         Follow routes to this target; without it and without --to, others only avoid the vehicle.
+    target         Follow routes to this target.
     to             Go to this place, as 46.81,9.84, xy:X,Y or cell:ROW,COL.
     drive          By missions, or by guided setpoints.
     arm            Arm it and set its mode. Default: the pilot does both.
@@ -115,12 +115,12 @@ class Drives:
 class Vehicle:
     """Identity of a vehicle, in the swarm and on its link.
 
-    id           Its name in the swarm; if not given, mav1 of system 1.
+    id           Its name in the swarm. Default: mav1 of system 1.
     group        Its group.
     radius       Metres around it that others keep clear.
-    sysid        Its MAVLink system; if not given, the first autopilot.
-    lost_after   Time without heartbeat or position, after which it is left to its fail-safe.
-    signing_key  File of 64 hexadecimal digits: messages are signed; unsigned ones are ignored.
+    sysid        Its MAVLink system. Default: the first autopilot.
+    lost_after   Time without heartbeat or position until it is left to its fail-safe.
+    signing_key  File of 64 hexadecimal digits: messages are signed, unsigned ones ignored.
     """
 
     panel: ClassVar[str | None] = "Identity of the vehicle"
@@ -138,8 +138,8 @@ def mavlink(
 ) -> None:
     """Join a PX4 or ArduPilot vehicle to a running swarm, until Ctrl-C.
 
-    The swarm's vehicles avoid it. With --target or --to it follows the swarm's routes there. It is armed, and its
-    mode is set, with --arm only. One process for each vehicle; docs/mavlink.md has the rest.
+    The swarm's vehicles avoid it. With --target or --to it follows the swarm's routes there. One process for each
+    vehicle (docs/mavlink.md).
 
     swarm gateway mavlink udpin:127.0.0.1:14540
 

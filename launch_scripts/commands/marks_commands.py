@@ -113,8 +113,7 @@ def show(store: Store, as_json: AsJson = False) -> None:
 def export(store: Store, out: Annotated[Path, typer.Option()], force: Force = False) -> None:
     """Export the marks of a store.
 
-    JSON holds all marks and learned factors. Other formats hold the winning marks as pixels or
-    polygons.
+    JSON has all marks and learned factors, other formats the winning marks.
 
     swarm marks export runs/LAST/map.sqlite --out marks.json
 

@@ -91,7 +91,7 @@ def _left(name: str, runs: Path) -> LeftRun:
 def report(run: RunArgument = "LAST", runs: Runs = Path("runs")) -> None:
     """Write the report of a run again: report.html, one file for any browser.
 
-    It has metrics, map, plots, tables, the scenario as it ran, machine and versions. Every run writes it.
+    Every run writes it.
 
     swarm runs report LAST
     """
@@ -111,8 +111,8 @@ def export(
 ) -> None:
     """Export a run for a GIS, a spreadsheet or Foxglove.
 
-    Layers: vehicle_tracks and target_tracks with the time of each point, captures, routes that vehicles began with
-    their certified gaps, and marks as areas of equal kind and pace. docs/gis/routes.md has their coordinates.
+    Layers: vehicle_tracks and target_tracks with the time of each point, captures, routes with their certified
+    gaps, and marks as areas of one kind and pace (docs/gis/routes.md).
 
     swarm runs export LAST
 

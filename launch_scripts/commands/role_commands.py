@@ -78,10 +78,9 @@ class Own:
 def role(name: Annotated[str, typer.Argument(metavar="ROLE")], part: Part, own: Own) -> None:
     """Start one process of a swarm, by hand, on any machine.
 
-    A router with certificates admits the names of the scenario, each with its rights (docs/operate/access.md);
-    `--connect` links it to another router. A keeper stores the marks and serves the terrain to machines without
-    its files. `targets` moves the simulated targets and counts collisions. A monitor records the run and serves
-    its live view.
+    `--connect` links a router to another one. A keeper stores the marks and serves the terrain to machines without
+    its files. `targets` moves the simulated targets and counts collisions. A monitor records the run and serves its
+    live view.
 
     swarm role router my.toml --listen tcp/127.0.0.1:7447
 

@@ -105,9 +105,8 @@ class SomeProcesses:
 def demo(run: RunOptions) -> int:
     """Run the built-in example: 99 ground vehicles and a drone chase 10 targets.
 
-    The same as `swarm up demo`. Ends after --seconds. Without it: a minute after the start-up, or later when the
-    last live view closes. Ctrl-C ends it. Leaves runs/RUN/ with run.rrd, report.html, report.json, report.png and a
-    log file per process.
+    The same as `swarm up demo`. Without --seconds it ends a minute after the start-up, or later when the last live
+    view closes. Ctrl-C ends it. Recording, report and logs are in runs/RUN/.
 
     swarm demo --seconds 20 --port 0
     """
@@ -231,12 +230,11 @@ def ps(all: Annotated[bool, typer.Option("--all", "-a")] = False, as_json: AsJso
 def down(run: RunArgument = None) -> int:
     """End a run of this machine as Ctrl-C does, and wait for its report, at most two minutes.
 
-    If the run has not ended, a second `swarm down` kills the processes that are left. If the launcher is gone, the
-    first one kills them.
+    A second `swarm down` kills the processes that are left; so does the first if the launcher is gone.
 
     swarm down
 
-    run  Name of the run, or its folder. May be omitted if exactly one run is running here.
+    run  Name of the run, or its folder; optional if exactly one run is running here.
     """
     from launch_scripts.launcher.console import Terminal, what_is_left
     from launch_scripts.observe.run_folders import is_of_a_swarm, read_report
@@ -286,10 +284,10 @@ def logs(
 
     swarm logs planner-t3 -f
 
-    process  One process, such as planner-t3; if not given, all by time.
+    process  One process, such as planner-t3. Default: all, by time.
     follow   Go on with new lines until the run ends.
-    lines    Print at most this number of lines of the past.
-    run      Name of the run, or its folder; if not given, the newest active run, else the newest ended one.
+    lines    Most lines of the past.
+    run      Name of the run, or its folder. Default: the newest active run, else the newest ended one.
     """
     found = _chosen(run)
     names = sorted({file.name.partition(".log")[0] for file in _log_files(found.folder)})
@@ -317,7 +315,7 @@ def open(run: RunArgument = None, only_print: Annotated[bool, typer.Option("--pr
 
     swarm open
 
-    run         Name of the run, or its folder; if not given, the newest active run, else the newest ended one.
+    run         Name of the run, or its folder. Default: the newest active run, else the newest ended one.
     only_print  Print the address, and open no browser.
     """
     import webbrowser
@@ -342,7 +340,7 @@ def kill(process: Annotated[str, typer.Argument(metavar="ROLE-ID")], run: RunOpt
     swarm kill planner-t3
 
     process  The process, such as planner-t3.
-    run      Name of the run, or its folder. May be omitted if exactly one run is running here.
+    run      Name of the run, or its folder; optional if exactly one run is running here.
     """
     found = _chosen(run, only=True)
     running = found.processes()

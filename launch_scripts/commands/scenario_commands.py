@@ -69,7 +69,7 @@ def new(file: Annotated[Path, typer.Argument(metavar="FILE")], choices: Choices)
 
     swarm new ridge.toml --terrain dem.tif --photo photo.tif --preset hiker --vehicles 12 --targets 2
 
-    file  The scenario to write, such as my.toml.
+    file  The scenario to write.
     """
     if file.suffix != ".toml":
         raise ConfigError(f"{file}: the name of a scenario ends in .toml, such as {file.stem or 'my'}.toml")
@@ -158,8 +158,8 @@ def check(
 def doctor(runs: Runs = Path("runs"), as_json: AsJson = False) -> int:
     """Check if this machine and installation can run a swarm.
 
-    Python, packages, compiled planners, cores, memory, open files, Zenoh over loopback, clock
-    and disk. Each line is ok, a warning or a failure. Exit code 1 if a swarm cannot run here.
+    Python, packages, compiled planners, cores, memory, open files, Zenoh over loopback, clock and disk. Exit code 1
+    if a swarm cannot run here.
 
     swarm doctor
 

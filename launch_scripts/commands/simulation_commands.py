@@ -49,7 +49,7 @@ def simulate(
 ) -> int:
     """Simulate a scenario in one process, faster than real time.
 
-    It runs the shipped services on a memory bus and a manual clock, and leaves the same folder as `swarm up`.
+    It leaves the same folder as `swarm up`.
 
     swarm simulate jacksboro --seed 7 --seconds 60 --trace events.log
 
@@ -196,17 +196,17 @@ def run(
 ) -> int:
     """Run a study: scenarios x settings x seeds, on many processes or machines.
 
-    Results are kept as they come: a second start, also with other seeds or settings, runs only the missing trials.
-    Exit code 1 if an invariant broke in any trial, or if a trial has no result. It needs the extra "sweep".
+    A second start, also with other seeds or settings, runs only the missing trials. Exit code 1 if an invariant
+    broke in any trial, or if a trial has no result. It needs the extra "sweep".
 
     swarm study run study.toml
 
     swarm study run study.toml --scheduler tcp://127.0.0.1:8786 --out results
 
-    study      A .toml file with scenarios, settings and seeds, or a built-in name.
-    scheduler  An existing cluster of Dask, such as tcp://127.0.0.1:8786.
-    workers    Processes of this machine; as many as it has cores if not given.
-    out        Folder of the results; sweeps/NAME of the study if not given.
+    study      A .toml file, or a built-in name.
+    scheduler  An existing cluster of Dask.
+    workers    Processes of this machine. Default: one per core.
+    out        Folder of the results. Default: sweeps/NAME of the study.
     """
     from rich.console import Console
 

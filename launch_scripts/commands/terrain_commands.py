@@ -59,10 +59,8 @@ def info(
 ) -> None:
     """Describe a terrain file or the terrain of a scenario.
 
-    Reads .tif, .tiff, .img, .hgt, .bil, .flt, .dem, or one of these in a .zip; .dt2, .nc, .vrt, .asc, .grd, .npz,
-    .csv and .xyz grids, land cover (ESA WorldCover, CORINE, NLCD), MovingAI .map, ROS map_server .yaml or .yml, and
-    .png with --resolution-m and --height-scale. Lines after the table state processing steps and notes; those with
-    a ! report possible mistakes.
+    It reads the formats of terrain.source (docs/reference/scenario.md) and land cover; a .png needs --resolution-m
+    and --height-scale. Lines after the table that begin with ! report possible mistakes.
 
     swarm terrain info srtm.hgt
     swarm terrain info dem.tif --resolution-m 20 --fill
@@ -73,7 +71,7 @@ def info(
     fill                Fill voids from their surroundings instead of making them lethal.
     cover               A raster of land-cover codes on the same ground.
     cover_codes         Legend of the land cover: worldcover, corine, corine-level-3, nlcd, or a CSV file.
-    elevation_encoding  Give metres if the whole numbers are heights, though they look like land-cover codes.
+    elevation_encoding  metres: whole numbers which look like land-cover codes are heights.
     """
     options = {
         "crs": crs, "resolution_m": resolution_m, "height_scale": height_scale, "nodata": "fill" if fill else None,
@@ -138,8 +136,7 @@ def cost(
 ) -> None:
     """Build the prior cost map of a scenario; write it and a picture of it.
 
-    Cost is a pace in seconds per metre: 0.1 is 10 m/s. Lethal cells are never
-    entered. Correct mistakes in the scenario: cost.max_slope_deg, cost.class_factor, cost.zones, terrain.labels.
+    Correct mistakes in the scenario: cost.max_slope_deg, cost.class_factor, cost.zones, terrain.labels.
 
     swarm terrain cost jacksboro --picture cost.png
     swarm terrain cost mine.toml --out cost.tif
@@ -242,8 +239,7 @@ def reach(
 ) -> None:
     """Compute the driving time to a location from everywhere, as GeoTIFF or areas.
 
-    With --from: the corridor of near-optimal paths between two locations. Each of
-    its cells has the time of a good path
+    With --from: the corridor of near-optimal paths between two locations. Each of its cells has the time of a path
     that passes it; areas state the seconds lost against the best path.
 
     swarm terrain reach dem.tif --to 46.78,9.87 --preset hiker --out seconds.tif
@@ -251,8 +247,8 @@ def reach(
     swarm terrain reach dem.tif --from 46.81,9.84 --to 46.78,9.87 --slack 0.1 --out corridor.tif
 
     terrain  A terrain file, a scenario file or a built-in scenario.
-    to       Destination: LAT,LON, xy:X,Y in metres or cell:ROW,COL.
-    start    Start of a corridor: only cells on near-optimal paths from there.
+    to       Destination, as LAT,LON, xy:X,Y or cell:ROW,COL.
+    start    Start of a corridor, in the same forms.
     slack    With --from: a path may take this share longer than the best.
     out      Write .tif: seconds, -1 without a path; {areas}: areas.
     every_s  Time between areas. Default 600 s; for a corridor a fifth of the slack time.
@@ -299,9 +295,9 @@ def classify(
 
     swarm terrain classify dem.tif photo.tif --labels labels.toml --picture classes.png
 
-    Without --labels it uses rules. With labels the classes are learnt from them, and two tables show the
-    predictions for the labelled cells: by the rules, and by a model that was trained without the polygon of the
-    cell. docs/gis/cover.md has the form of a file of labels.
+    Without --labels it uses rules. With labels (docs/gis/cover.md) the classes are learnt from them, and two tables
+    show the predictions for the labelled cells: by the rules, and by a model that was trained without the polygon
+    of the cell.
 
     elevation  The elevation file.
     photo      The colour photo.

@@ -59,7 +59,7 @@ def send(
     then: Then = "hold",
     as_json: AsJson = False,
 ) -> int:
-    """Send a vehicle to a place, or to one place after the other. It chases no target meanwhile.
+    """Send a vehicle to one or more places. It chases no target meanwhile.
 
     The newest order counts. `swarm order ls` and `swarm status` show its progress.
 
@@ -95,15 +95,15 @@ def add(
 ) -> None:
     """Start an agent with extra vehicles. Runs until they have left, or until Ctrl-C.
 
-    They enter where cells are free, and chase their group's targets. Ctrl-C takes them off the map. If the
-    process is killed they stay where they are; the same command finds them again.
+    They enter where cells are free, and chase their group's targets. Ctrl-C takes them off the map. If the process
+    is killed they stay; the same command finds them again.
 
     swarm order vehicle add my.toml --id extra --group all --count 5 --at 36.50,-84.29
 
     id     Name of the agent that hosts them.
     group  The group of the scenario to which they belong.
     count  How many vehicles.
-    at     LAT,LON, xy:X,Y or cell:ROW,COL near which they enter; else anywhere.
+    at     Place near which they enter. Default: anywhere.
     """
     if at is not None:
         read_place(at, "--at")
@@ -114,7 +114,7 @@ def add(
 def remove(names: list[str], where: Where, as_json: AsJson = False) -> int:
     """Remove vehicles from the map. Returns once their cells are free for others.
 
-    An agent that was added ends when its last vehicle has left; one of the scenario goes on without them.
+    An added agent ends when its last vehicle has left.
 
     swarm order vehicle remove extra a0-03
 
@@ -145,8 +145,8 @@ def remove(names: list[str], where: Where, as_json: AsJson = False) -> int:
 def forget(name: str, where: Where) -> None:
     """Release the cells of vehicles of a dead process. Use only if no vehicle is there.
 
-    Only a person can know that: a robot whose program has died is still in its cell. Never use it for such a robot.
-    Between machines the command needs the external vehicle's own certificate.
+    A robot whose program has died is still in its cell: never use it then. Between machines the command needs the
+    external vehicle's own certificate.
 
     swarm order vehicle forget extra
 

@@ -52,8 +52,8 @@ def add(
 
     swarm order zone add --file quarry.geojson --name quarry --class truck
 
-    Each area of a file becomes a zone: quarry, or quarry-1, quarry-2 ... if there are several. A fence file states
-    which areas to keep in. For other files, --kind keep-in closes everything outside the areas.
+    Several areas of a file become the zones quarry-1, quarry-2 ... A fence file states which areas to keep in; for
+    other files, --kind keep-in closes everything outside the areas.
 
     polygon        Corners as 'LAT,LON LAT,LON ...', or xy:X,Y, or cell:ROW,COL from the north-west.
     file           A file of areas instead, as in a scenario's zones, in any coordinate system.

@@ -64,16 +64,16 @@ OK, UNREACHABLE, OUTSIDE, LETHAL_START, NO_TARGET, SEARCHING = range(len(STATUSE
 
 
 class Route(Bounded, frozen=True, kw_only=True):
-    """One route. `directions` holds one code 0..7 per step, clockwise from north. Its numbers are finite if the
-    status is OK.
+    """One route. Its numbers are finite if the status is OK.
 
-    cost_s         travel time of the whole route, as driven from middle to middle of neighbouring cells
-    lower_bound_s  no route from cell to neighbouring cell is quicker, on the map as the tree knows it; proven
-    length_m       length of the way given
+    directions     one per step
+    cost_s         travel time of the whole route, from middle to middle of neighbouring cells
+    lower_bound_s  proven: no route from cell to neighbouring cell is quicker, on the map as the tree knows it
+    length_m       of the way given
     remaining_s    cost-to-go after it, 0 at the target
-    legs           of each straight segment of a pulled route, over how many of the steps it goes, from
-                   the middle of one cell to that of another. The steps are along the cells that it crosses, and
-                   may themselves be driven. Costs and bound are of the route that was pulled. Empty: it was not
+    legs           for each straight segment of a pulled route, its number of steps, from the middle of one cell to
+                   that of another. The steps are along the cells that it crosses, and may themselves be driven.
+                   Costs and bound are of the route that was pulled. Empty: it was not
     """
 
     status: RouteStatus
@@ -253,7 +253,6 @@ class Routes(Bounded, frozen=True, kw_only=True, dict=True):
 
     statuses    RouteStatus, as its index
     starts      cells
-    steps       number of steps given
     directions  of all routes, one after the other: eight steps in three bytes, the first in the lowest three bits
     legs        of all routes, one after the other; empty if none is pulled
     """

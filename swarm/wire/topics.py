@@ -238,7 +238,7 @@ SENT = Topic(
     "sent", "place/{places}/sent/{author}", vehicles.Chasers, access(put="agent:author", hear="places:places"),
     put_bytes=_LONG,
 )  # fmt: skip
-"""Vehicles of an agent which are sent to places, and where their routes may begin.
+"""The same of vehicles which are sent to places.
 
 Rate: as chasers
 """
@@ -256,7 +256,7 @@ HOST_STATE = Topic(
     put_bytes=_LONG,
 )  # fmt: skip
 """Positions and wanted cells of a host's vehicles in a shard: to its leader, or to all members while it has none.
-Each counts, as two generations of a host may send.
+Two generations of a host may send.
 
 Rate: on change, else 5 Hz
 """
@@ -265,8 +265,8 @@ TABLE = Topic(
     access(put="agent:agent", serve="agent:agent", ask="agent:member", hear="agent:member"), request=traffic.Claim,
     echoed=False, priority=Priority.INTERACTIVE, put_bytes=_LONG, ask_bytes=_SHORT, answer_bytes=_LONG,
 )  # fmt: skip
-"""Granted cells of a shard, from its leader to a member. A query claims leadership: the member promises to store no
-table of an older epoch, and replies with its stored one.
+"""Granted cells of a shard, from its leader to a member. A query claims leadership: the member replies with its
+stored table.
 
 Rate: on change, and at 5 Hz until the others have it on file
 """
@@ -292,7 +292,7 @@ LEFT = Topic(
     access(put="agent:agent rover:agent", hear="agent:host rover:host"), newest=False,
     priority=Priority.INTERACTIVE, put_bytes=_LONG,
 )  # fmt: skip
-"""Cells which vehicles of a host have left, to a host whose vehicles wait for them; each counts.
+"""Cells which vehicles of a host have left, to a host whose vehicles wait for them.
 
 Rate: on change, and at 5 Hz until the leader has counted it
 """
@@ -342,7 +342,7 @@ POSE = Topic(
     access(put="targets tracker:target", hear="agent planner targets monitor tracker:target"), newest=False,
     free=("put",), put_bytes=_SHORT,
 )  # fmt: skip
-"""Position of a target, from a tracker; trackers must not replace each other's messages.
+"""Position of a target, from one of its trackers.
 
 Rate: per quarter of a cell, at least 2 Hz
 """
@@ -366,8 +366,7 @@ OBSTACLE = Topic(
     "body", "body/{id}", vehicles.Obstacle, access(put="rover:id targets", hear="agent rover targets monitor"),
     newest=False, free=("put",), priority=Priority.INTERACTIVE, put_bytes=_SHORT,
 )  # fmt: skip
-"""Position of an obstacle, such as an outside vehicle or a person; two senders under one id must not
-replace each other's messages.
+"""Position of an obstacle, such as an outside vehicle or a person. Two senders may use one id.
 
 Rate: 10 Hz in motion, else at least 1 Hz
 """
@@ -403,7 +402,7 @@ NAMELESS_ROUTE = replace(
     ROUTE, name="nameless-route", key="target/{target}/route",
     access=access(serve="planner:target", ask="agent rover"),
 )  # fmt: skip
-"""Routes for askers without a name, who take turns as one.
+"""Routes to the target for askers without a name, who take turns as one.
 
 Rate: asked
 """
@@ -411,7 +410,7 @@ NAMELESS_COST = replace(
     COST, name="nameless-cost", key="target/{target}/cost",
     access=access(serve="planner:target", ask="agent targets monitor rover"),
 )  # fmt: skip
-"""Costs for askers without a name, who take turns as one.
+"""Costs for the same askers.
 
 Rate: asked
 """
@@ -453,7 +452,7 @@ GIVE_ORDER = Topic(
     "give-order", "order/{keeper}/give", orders.Orders, access(serve="keeper:keeper"), request=orders.GiveOrder,
     published=False, priority=Priority.INTERACTIVE, ask_bytes=_LONG, answer_bytes=4 * _LONG,
 )  # fmt: skip
-"""Gives an order: pause, stop, targets of a group, added targets, settings.
+"""Gives an order.
 
 Rate: asked by people
 """
@@ -470,7 +469,7 @@ OBEYED = Topic(
     "obeyed", "obeyed/{role}/{id}", orders.Obeyed, access(serve="agent:role,id planner:role,id targets:role,id"),
     request=orders.Obey, published=False, priority=Priority.INTERACTIVE, ask_bytes=_LONG, answer_bytes=_SHORT,
 )  # fmt: skip
-"""Reply as soon as a process obeys an order.
+"""Obedience of a process to an order.
 
 Rate: asked after each order
 """

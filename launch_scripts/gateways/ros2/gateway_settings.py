@@ -139,10 +139,10 @@ class SwarmSide(Section, frozen=True, kw_only=True):
 
 
 class TopicSettings(Section, frozen=True, kw_only=True):
-    """Changes to a topic of the table.
+    """Changes to a forwarded topic.
 
-    topic  its name in ROS, with {vehicle} or {target} as in the table; default: as in the table
-    hz     highest rate; 0: as in the table
+    topic  its name in ROS, with {vehicle} or {target} as above; default: as above
+    hz     highest rate; 0: as above
     """
 
     topic: str = ""
@@ -249,8 +249,8 @@ class Settings(Section, frozen=True, kw_only=True):
     """Settings of `swarm gateway ros2`. An empty file is valid.
 
     vehicles  ids of vehicles which ROS receives, with * and ?
-    forward   names of forwarded topics of the table; empty: all
-    topics    changes to topics of the table, by name
+    forward   names of forwarded topics; empty: all
+    topics    changes to forwarded topics, by name
     incoming  allowed incoming topics; by default none
     """
 

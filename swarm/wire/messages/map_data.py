@@ -124,19 +124,17 @@ def owner_of(author: str) -> str:
 class MarkSet(Message, frozen=True, kw_only=True, gc=False, tag=schema_of("marks")):
     """All marks of one author in one tile. Replaces the author's set with a lower (epoch, seq).
 
-    An author counts `seq` in steps of 65536. The numbers between are for keepers, which compact the sets of dead
-    authors: they drop marks which others overrule. Such a set without marks is a tombstone: readers drop the
-    author's marks in that tile.
+    An author counts `seq` in steps of 65536. The numbers between are for keepers, which drop superseded marks of
+    dead authors. Such a set without marks is a tombstone: readers drop the author's marks in that tile.
 
     tile       in a grid of N tiles, 0 to N - 1 are tiles for all vehicles, row by row from the north-west. N holds
                the author's learned factors. n (N + 1) + t is tile t for vehicle class n only
     epoch      1; the next whenever a keeper took the living author for dead
-
     cells      indices inside the tile, row-major over 32 x 32, strictly increasing
     kinds      MarkKind
     paces      s/m for PACE, ignored otherwise
     stamps_ns  hybrid logical time of each mark
-    untils_ns  when each mark ends by itself, FOREVER (2^63 - 1) if it does not; empty if none does
+    untils_ns  end of each mark, or FOREVER (2^63 - 1); empty if none ends
     """
 
     author: fields.Id
@@ -166,13 +164,13 @@ class MarkSet(Message, frozen=True, kw_only=True, gc=False, tag=schema_of("marks
 
 
 class MarkSets(Message, frozen=True, kw_only=True, gc=False, tag=schema_of("mark-sets")):
-    """Many sets of one author and group, as one reply carries them: columns over the sets, then the statements of
-    all sets, one set after the other.
+    """Many sets of one author and group: columns over the sets, then the statements of all sets, one set after the
+    other.
 
     tiles      of each set; none twice
     counts     statements of each set
     ending     1 where a set has `untils_ns`
-    untils_ns  of the statements of the sets that have them
+    untils_ns  of the statements of these sets
     """
 
     author: fields.Id
@@ -219,15 +217,15 @@ _Place = tuple[fields.Id, fields.Tile]
 
 
 class Digest(Message, frozen=True, kw_only=True, tag=schema_of("digest")):
-    """Sets that a replica holds: author -> columns of tile (uint32), epoch and seq (uint64 each), interleaved as
-    rows of 20 bytes. An author's own digest is complete for that author; the keeper's covers what it committed.
-    Only a keeper (by `author`) names sets of others.
+    """Sets that a replica holds. An author's own digest is complete for that author; the keeper's covers what it
+    committed. Only a keeper (by `author`) names sets of others.
 
-    role   of its sender; not used
-    whole  false: only tiles that changed lately, published between the whole digests; or a part of a whole one
-    seq    counts this sender's digests, so that one that comes late replaces no newer one; 0 if it does not count
-    after  of a part: the author and the tile after which it begins; none if it begins with the first
-    until  of a part: the author and the tile with which it ends; none if it ends with the last
+    role   not used
+    held   author -> rows of tile (uint32), epoch and seq (uint64 each)
+    whole  false: only tiles that changed lately, or a part of a whole digest
+    seq    number of the digest, so that a late one replaces no newer one; 0: not numbered
+    after  of a part: author and tile after which it begins; None: with the first
+    until  of a part: author and tile with which it ends; None: with the last
     """
 
     author: fields.Id
@@ -256,7 +254,7 @@ MOST_TILES_ASKED = 4096
 class MarksRequest(Message, frozen=True, kw_only=True, tag=schema_of("marks-request")):
     """Asks authors and the keeper for sets: of these authors and tiles, or of all where a list is empty.
 
-    bulk  answers may be MarkSets, under a key with `-` for region and tile
+    bulk  replies may be MarkSets, under a key with `-` for region and tile
     """
 
     authors: Annotated[list[fields.Id], _AUTHORS] = []
@@ -273,10 +271,10 @@ _LAYERS = Meta(max_length=100)
 
 
 class BaseMap(Message, frozen=True, kw_only=True, tag=schema_of("base-map")):
-    """A keeper's copy of the run's terrain, for machines without its files.
+    """A keeper's copy of the terrain, for machines without its files.
 
-    digests  layer -> 8 bytes per region (256 x 256 cells): BLAKE2b of its bytes, in order of region
-    notes    sentences about where the terrain came from
+    digests  layer -> 8 bytes per region, in order: BLAKE2b of its bytes
+    notes    origin of the terrain, in sentences
     """
 
     keeper: fields.Id
@@ -308,8 +306,8 @@ class BaseMapRequest(Message, frozen=True, kw_only=True, tag=schema_of("base-map
 
 
 class BaseMapTile(Message, frozen=True, kw_only=True, tag=schema_of("base-map-tile")):
-    """One layer of one region. `data` is zlib of the values' bytes: first the lowest byte of every value, row by
-    row, then the next."""
+    """One layer of one region. `data` is zlib of the lowest byte of every value, row by row, then of the next
+    bytes."""
 
     layer: fields.Word
     region: fields.Region

@@ -28,18 +28,18 @@ _Seconds = Annotated[float, Meta(gt=0, le=1e9)]
 
 
 class ZoneOrder(Message, frozen=True, kw_only=True, tag=schema_of("zone-order")):
-    """Asks a keeper to close an area, to open it again, or which zones there are.
+    """Asks a keeper to close an area, to open it again, or for all zones.
 
-    name          of the zone; one that exists is replaced. Without a name the keeper finds one
-    kind          lethal: no vehicle enters; pace: cells that the terrain does not close are driven at
-                  `pace_s_per_m`, with any marks
-    polygon       corners [row, col]; (0, 0) is the north-west corner of the terrain, (1, 1) of the cell one further
-    polygon_m     corners [x_m, y_m] instead, as poses have them
-    corners       places instead: "46.81,9.84" (latitude, longitude), "xy:X,Y" or "cell:ROW,COL"
-    lasts_s       after this time the zone ends by itself; without it never
-    vehicle_class  for vehicles of this class only, one of the scenario's `[[classes]]`; without it for all
-    stamp_ns      when it was given, as in `GiveOrder`
-    holes         parts of the polygon which are not of the zone, each as corners [row, col]; only with `polygon`
+    name           replaces a zone of this name; without it the keeper chooses one
+    kind           lethal: no vehicle enters; pace: cells that the terrain does not close have `pace_s_per_m`,
+                   whatever their marks
+    polygon        corners [row, col]; [0, 0] is the north-west corner of the terrain
+    polygon_m      corners [x_m, y_m] instead, as in poses
+    corners        corners as places instead
+    lasts_s        time until the zone ends, above 0 and at most 1e9; None: without end
+    vehicle_class  None: for all classes
+    stamp_ns       as in `GiveOrder`
+    holes          parts of `polygon` outside the zone, as corners [row, col]
     """
 
     action: Literal["add", "remove", "list"] = "list"
@@ -88,13 +88,13 @@ def _check_place(name: str, place: str) -> None:
 
 
 class Zone(fields.Bounded, frozen=True, kw_only=True):
-    """A zone that stands.
+    """A zone in force.
 
-    pace_s_per_m  None of a lethal zone
-    cells         how many cells it covers
-    window        [row0, col0, row1, col1] around them
-    until_ns      when it ends by itself, by the keeper's clock; None if it does not
-    vehicle_class  for whom it is; None: for all
+    pace_s_per_m   None of a lethal zone
+    cells          number of cells
+    window         [row0, col0, row1, col1] around them
+    until_ns       its end by the keeper's clock; None: without end
+    vehicle_class  None: for all classes
     """
 
     name: fields.Id
@@ -107,10 +107,10 @@ class Zone(fields.Bounded, frozen=True, kw_only=True):
 
 
 class Zones(Message, frozen=True, kw_only=True, tag=schema_of("zones")):
-    """The zones that stand, and on the disk of this keeper.
+    """The zones in force, as on the disk of this keeper.
 
-    changed  the name of the zone that was added or removed, and `sets` its mark sets, as rows of a digest: a
-             process that holds these obeys
+    changed  name of the added or removed zone
+    sets     its mark sets, as rows of a digest: a process that holds these obeys
     """
 
     keeper: fields.Id
@@ -135,12 +135,11 @@ class Order(fields.Bounded, frozen=True, kw_only=True):
 
     name      of the vehicle, group, target or setting
     stamp_ns  of two orders about one subject the later counts
-    off       taken back: a pause ended, a vehicle goes, a group chases what the scenario says, a target is removed,
-              a setting is the scenario's
-    targets   whom a group chases; all if empty
+    off       taken back: a pause ends, a vehicle goes, a target is removed, group or setting are as in the scenario
+    targets   of a group; all if empty
     value     of a setting
-    cell      where a target was put
-    added     the target walks as this says, not as the scenario does
+    cell      place of a target
+    added     the target walks as stated here, not as in the scenario
     """
 
     subject: Subject
@@ -160,12 +159,12 @@ class Order(fields.Bounded, frozen=True, kw_only=True):
 
 
 class GiveOrder(Message, frozen=True, kw_only=True, tag=schema_of("give-order")):
-    """Asks a keeper to enter an order into its book. Fields as in `Order`.
+    """Gives an order to a keeper. Fields as in `Order`.
 
-    subject   None only asks for orders in force
+    subject   None: only asks for the orders in force
     row, col  instead of a cell
-    at        a place instead: "46.81,9.84" (latitude, longitude), "xy:X,Y" or "cell:ROW,COL"
-    new       the target must not be there yet; otherwise it must
+    at        a place instead of a cell
+    new       true: the target must not exist yet; else it must
     stamp_ns  when it was given: where codes authenticate orders, an order counts once, and for a minute
     """
 
@@ -205,7 +204,7 @@ class GiveOrder(Message, frozen=True, kw_only=True, tag=schema_of("give-order"))
 class Orders(Message, frozen=True, kw_only=True, tag=schema_of("orders")):
     """All orders that a process knows: of a keeper, those on its disk.
 
-    given  the order that this answers, if it answers one
+    given  the order to which this replies
     """
 
     role: fields.Id
@@ -224,10 +223,10 @@ class VehicleGoals(fields.Bounded, frozen=True, kw_only=True):
 
     name      of the vehicle
     stamp_ns  of two orders about one vehicle the later counts
-    off       recalled: it chases targets
+    off       recalled
     cells     the places, in order
     then      as in `SendVehicle`
-    done      how many it has reached, laps included
+    done      number of places reached, laps included
     """
 
     name: fields.VehicleId
@@ -246,10 +245,9 @@ class SendVehicle(Message, frozen=True, kw_only=True, tag=schema_of("send-vehicl
     """Asks a keeper to send a vehicle to places, one after the other. It replaces the places of an earlier order.
 
     vehicle   "" only asks for the goals of all vehicles
-    places    as "46.81,9.84" (latitude, longitude), "xy:X,Y" or "cell:ROW,COL"
-    then      what the vehicle does after the last: hold there, chase targets, or begin again
+    then      after the last place: hold there, chase targets, or begin again
     off       recall: it chases targets again
-    stamp_ns  when it was given, as in `GiveOrder`
+    stamp_ns  as in `GiveOrder`
     """
 
     vehicle: Annotated[str, Meta(max_length=64)] = ""
@@ -273,12 +271,12 @@ class SendVehicle(Message, frozen=True, kw_only=True, tag=schema_of("send-vehicl
 
 
 class Goals(Message, frozen=True, kw_only=True, tag=schema_of("goals")):
-    """The goals of an agent's vehicles that a keeper has on its disk.
+    """The goals of vehicles, as on a keeper's disk.
 
     id      of the keeper
-    agent   whose vehicles they are, where one agent's are told
-    shared  cell -> how many vehicles of all agents were sent there, of cells with more than one
-    given   the order that this answers, if it answers one
+    agent   host of the vehicles; None: goals of all
+    shared  cells to which several vehicles of all agents were sent, each with their number
+    given   the order to which this replies
     """
 
     id: fields.Id
@@ -296,7 +294,7 @@ class GoalState(fields.Bounded, frozen=True, kw_only=True):
 
     name      of the vehicle
     stamp_ns  of the order
-    done      how many places it has reached, laps included
+    done      number of places reached, laps included
     state     queued: it waits for a route; underway; delayed: it waits for right of way; blocked: there is no way,
               or no planner; standby: an operator stopped it; completed: it has reached the last; canceled: it was
               recalled; failed: it has left the map
@@ -313,7 +311,7 @@ class GoalState(fields.Bounded, frozen=True, kw_only=True):
 
 
 class GoalStates(Message, frozen=True, kw_only=True, tag=schema_of("goal-states")):
-    """The states of all vehicles of an agent that were sent somewhere."""
+    """The states of an agent's sent vehicles."""
 
     agent: fields.Id
     stamp_ns: fields.StampNs
@@ -326,11 +324,11 @@ class GoalStates(Message, frozen=True, kw_only=True, tag=schema_of("goal-states"
 
 
 class Obey(Message, frozen=True, kw_only=True, tag=schema_of("obey")):
-    """Asks a process to answer as soon as it obeys: what it does and plans from then on goes by the order.
+    """Asks a process to reply as soon as it obeys. A zone is named by `author` and `sets`, any other order by
+    `subject`, `name` and `stamp_ns`.
 
-    author, sets             a zone: its author, and its sets as rows of a digest
-    subject, name, stamp_ns  any other order
-    goals                    the order is about the goals of the vehicle of that name
+    sets   rows of a digest
+    goals  the order is about the goals of the vehicle `name`
     """
 
     author: fields.Word = ""
@@ -346,7 +344,7 @@ class Obey(Message, frozen=True, kw_only=True, tag=schema_of("obey")):
 
 
 class Obeyed(Message, frozen=True, kw_only=True, tag=schema_of("obeyed")):
-    """Acknowledgement of a process that it obeys."""
+    """Reply of a process which obeys."""
 
     role: fields.Id
     id: fields.Id

@@ -19,11 +19,9 @@ class RouteRequest(Message, frozen=True, kw_only=True, tag=schema_of("route-requ
     """Asks for routes from cells to the planner's target. A person may give `row` and `col` instead of `cells`.
 
     vehicles   ids in the order of `cells`; newer routes are pushed to these until they ask another planner
-    max_cells  largest number of steps of each returned route; 0: the whole route, or as much as fits into one
-               message
-    force      True if a vehicle has reached the end of its route without the target: the planner extends its search
+    max_cells  most steps of a returned route; 0: all that fit into one message
+    force      true if a vehicle has reached the end of its route without the target: the planner extends its search
                window to these cells
-    vehicle_class  class of the vehicles; each class has its own tree, so its own routes
     """
 
     cells: Annotated[list[fields.Cell], fields.LARGE] = []
@@ -44,14 +42,13 @@ class RouteRequest(Message, frozen=True, kw_only=True, tag=schema_of("route-requ
 class RouteReply(Message, frozen=True, kw_only=True, tag=schema_of("route")):
     """A planner's reply, with a route from each start.
 
-    incarnation  of the planner
-    map_version  number of changes of its replica
-    tree_age_ms  time since the last full growth
-    pose_age_s   time since the pose arrived that the route leads to; None before the first
-    tracker_lost  no tracker publishes the target now: this is its last known position
-    vehicle_class  whose routes these are
+    incarnation    of the planner
+    map_version    number of changes of its replica
+    tree_age_ms    since the last full growth
+    pose_age_s     since the pose arrived to which the route leads; None before the first
+    tracker_lost   no tracker publishes the target now: this is its last known position
     lethal_target  the lethal cell where the target is, to which no route leads: the status is NO_TARGET
-    nearest_cell   the cell nearest to it which can be reached; None if none is near
+    nearest_cell   reachable cell nearest to it; None if none is near
     """
 
     target: fields.Id
@@ -75,7 +72,7 @@ class RouteReply(Message, frozen=True, kw_only=True, tag=schema_of("route")):
 class PlaceRouteRequest(Message, frozen=True, kw_only=True, tag=schema_of("place-route-request")):
     """Asks for routes from cells to a place. Else as in `RouteRequest`.
 
-    to  the cell of the place
+    to  cell of the place
     """
 
     to: fields.Cell
@@ -89,13 +86,11 @@ PlaceStatus = Literal["ok", "growing", "lethal_goal", "outside_goal"]
 
 
 class PlaceRouteReply(Message, frozen=True, kw_only=True, tag=schema_of("place-route")):
-    """Routes to a place, each with a proven lower bound.
+    """Routes to a place. Else as in `RouteReply`.
 
-    incarnation  of the process that plans
-    map_version  number of changes of its replica
-    status       "lethal_goal", "outside_goal": there is no route; "growing": some are not known yet, and their
-                 status is NO_TARGET: ask again
-    nearest_cell  the open cell nearest to a lethal goal; None if none is near
+    status        lethal_goal, outside_goal: there is no route; growing: some are not known yet, and their status
+                  is NO_TARGET: ask again
+    nearest_cell  open cell nearest to a lethal goal; None if none is near
     """
 
     to_cell: fields.Cell
@@ -114,7 +109,7 @@ class PushedRoute(Message, frozen=True, kw_only=True, tag=schema_of("pushed-rout
     """A newer route for a vehicle that follows this target, or goes to a place.
 
     target       None if it goes to a place
-    target_cell  of the target or of the place
+    target_cell  cell of target or place
     """
 
     vehicle: fields.VehicleId
@@ -126,7 +121,7 @@ class PushedRoute(Message, frozen=True, kw_only=True, tag=schema_of("pushed-rout
 
 
 class CostRequest(Message, frozen=True, kw_only=True, tag=schema_of("cost-request")):
-    """Asks what it costs to reach the planner's target from each of these cells, in a vehicle of a class."""
+    """Asks for the cost from each of these cells to the planner's target. Else as in `RouteRequest`."""
 
     cells: Annotated[list[fields.Cell], fields.LARGE] = []
     row: fields.Cell | None = None
@@ -139,8 +134,10 @@ class CostRequest(Message, frozen=True, kw_only=True, tag=schema_of("cost-reques
 
 
 class CostReply(Message, frozen=True, kw_only=True, tag=schema_of("cost")):
-    """A planner's answer: `cost_to_go_s` per asked cell, inf where there is no way or the cell is outside. Else as
-    `RouteReply`."""
+    """A planner's reply. Else as in `RouteReply`.
+
+    cost_to_go_s  per asked cell; inf where there is no way or the cell is outside
+    """
 
     target: fields.Id
     incarnation: fields.Incarnation
@@ -160,11 +157,11 @@ MOST_BELIEVED = 512
 
 
 class Believed(Message, frozen=True, kw_only=True, tag=schema_of("believed")):
-    """A planner's belief about the position of its unseen target. The newest replaces the older; without cells the
-    search is over.
+    """A planner's belief about the position of its unseen target, by square blocks of ground. The newest replaces
+    the older; without cells the search is over.
 
-    side_m  of the square blocks of ground that it tells of
-    cells   near the middle of each block, the likeliest blocks first
+    side_m  of a block
+    cells   near the middle of each block, the likeliest first
     shares  probability of each
     """
 
@@ -177,11 +174,12 @@ class Believed(Message, frozen=True, kw_only=True, tag=schema_of("believed")):
 
 
 class PlannerStatus(Message, frozen=True, kw_only=True, tag=schema_of("planner-status")):
-    """State of a planner.
+    """State of a planner. Else as in `RouteReply`.
 
-    window   [row0, col0, row1, col1] of the part grown last
-    tracker  whose pose the target was placed by last; None if that tracker has no name. Ages as in `RouteReply`
-    gap_*    driven cost over optimum of the vehicles that follow, at the last full growth; None before the first
+    window                      [row0, col0, row1, col1] of the part grown last
+    tracker                     sender of the newest pose; None if it has no name
+    gap_mean, gap_p95, gap_max  driven cost over optimum of the vehicles that follow, at the last full growth; None
+                                before the first
     """
 
     target: fields.Id
@@ -223,8 +221,8 @@ class TargetPose(Message, frozen=True, kw_only=True, tag=schema_of("pose")):
     incarnation  when the tracker began to track this target, by the clock of `stamp_ns`
     seq          grows within an incarnation
     lease_s      the tracker counts as lost when no pose of it has arrived for this time; 0 hands the target over
-    cell         the cell of the place; left out it is that of `x_m`, `y_m`
-    captures     how often it was captured
+    cell         -1: that of `x_m`, `y_m`
+    captures     number of captures
     jumps        how often it was put somewhere else, as after a capture
     """
 
@@ -243,7 +241,7 @@ class TargetPose(Message, frozen=True, kw_only=True, tag=schema_of("pose")):
 
 class Sighted(Message, frozen=True, kw_only=True, tag=schema_of("sighted")):
     """A sighting: a vehicle of this author saw a target within `uncertainty_m` of the place. It expires at
-    `until_ns`, and the author's next sighting of the target replaces it."""
+    `until_ns`; the author's next one of the target replaces it."""
 
     author: fields.Id
     group: fields.Id

@@ -13,17 +13,18 @@ from swarm.wire.messages import Message, schema_of
 
 
 class RunInfo(Message, frozen=True, kw_only=True, tag=schema_of("run")):
-    """The run that a process belongs to. `terrain` is a digest of grid, pace without marks and cost rules:
-    processes with different ones must not share a map.
+    """The run of a process. `terrain` is a digest of grid, pace without marks and cost rules: processes with
+    different ones must not share a map.
 
-    rows, cols, resolution_m  of the grid; 0 of a router, which has none
-    west_m, north_m, crs      where its north-west corner is, and in which coordinate system
-    now_ns                    its clock when it answered, as of its last tick; 0 before the first
-    vehicles, crew            how many vehicles the scenario has, and which processes it needs, as `role-id`
-    restarts                  how often the process was started again in this run
-    classes                   the classes of vehicles beside "ground", in the order of their numbers
-    wire_version              of its build
-    shard_cells               side of a shard of right of way: two layouts in one run would grant a cell twice
+    rows, cols       0 of a router
+    west_m, north_m  the north-west corner of the grid
+    crs              its coordinate system
+    now_ns           clock at the last tick; 0 before the first
+    vehicles         number of vehicles of the scenario
+    crew             processes which the scenario needs, as `role-id`
+    restarts         number in this run
+    classes          of vehicles beside "ground", in the order of their numbers
+    shard_cells      side of a shard: two layouts in one run would grant a cell twice
     """
 
     run_id: fields.Word
@@ -54,11 +55,11 @@ class RunInfo(Message, frozen=True, kw_only=True, tag=schema_of("run")):
 
 
 class Alarm(msgspec.Struct, frozen=True, kw_only=True):
-    """A process's notice to people that watch the run: a collision, an author beyond its quota.
+    """Notice to people: a collision, an author beyond its quota.
 
-    kind      a word of `launch_scripts.observe.alarms.KINDS`; any other is shown as it is
-    about     the process, target, author or vehicle that it is about
-    since_ns  when it began; over_ns when it was over, None while it lasts
+    kind     a word of `launch_scripts.observe.alarms.KINDS`; any other is shown as it is
+    about    process, target, author or vehicle
+    over_ns  when it ended; None while it lasts
     """
 
     kind: fields.Word
@@ -73,10 +74,11 @@ class Alarm(msgspec.Struct, frozen=True, kw_only=True):
 class Stats(Message, frozen=True, kw_only=True, tag=schema_of("stats")):
     """Counters of a process. Histograms are as in `swarm.runtime.stats`.
 
-    counts_by, histograms_by    name -> id of a target or vehicle -> the same, of that one alone
-    since                       counts are those of all incarnations of this process from this one on; 0: of its own
-    alarms                      open alarms, and the newest of the closed ones
-    web_port                    port of its own machine where people can look at it in a browser; 0: none
+    counts_by      name -> id of a target or vehicle -> its count
+    histograms_by  the same of histograms
+    since          first incarnation of this process whose counts are included; 0: its own only
+    alarms         open ones, and the newest closed ones
+    web_port       port of its live page on its machine; 0: none
     """
 
     role: fields.Id
@@ -106,9 +108,13 @@ class Stats(Message, frozen=True, kw_only=True, tag=schema_of("stats")):
 
 
 class Heartbeat(Message, frozen=True, kw_only=True, tag=schema_of("beat")):
-    """State of a candidate for one job, such as a planner or a standby. `ready`: it can do the job. `leads`: it
-    does. `seq`: number in its sender's life; only a greater one counts. `heard`: incarnations whose heartbeats its
-    sender has received."""
+    """State of a candidate for one job, such as a planner or a standby.
+
+    ready  it can do the job
+    leads  it does the job
+    seq    only a greater one of an incarnation counts
+    heard  incarnations whose heartbeats the sender has received
+    """
 
     role: fields.Id
     id: fields.Id
@@ -120,8 +126,7 @@ class Heartbeat(Message, frozen=True, kw_only=True, tag=schema_of("beat")):
 
 
 class Note(Message, frozen=True, kw_only=True, tag=schema_of("note")):
-    """An event for people: a capture, a restart, a closed road found. `cell` is its place, if it has one, `target`
-    the target that it is about."""
+    """An event for people: a capture, a restart, a closed road found."""
 
     role: fields.Id
     id: fields.Id

@@ -32,11 +32,10 @@ ShardSide = Annotated[int, Meta(ge=REGION_CELLS, le=MOST_SHARD_REGIONS * REGION_
 
 
 class Held(msgspec.Struct, frozen=True, array_like=True):
-    """Entries of one vehicle in driving order, in few bytes: along a route neighbouring ones differ little.
+    """Entries of one vehicle in driving order.
 
     first   cell of the first entry; 0 if there is none
-    turns   differences between successive steps from cell to cell, after the first step itself: zeros on a
-            straight path
+    turns   the first step from cell to cell, then differences between successive steps: zeros on a straight path
     stamps  (epoch, seq, count): the tables which added the entries, each with the number of entries in turn
     """
 
@@ -96,13 +95,14 @@ def _merged(base: dict[str, Held], changes: dict[str, Held]) -> dict[str, Held]:
 class Stand(fields.Part, frozen=True, array_like=True):
     """One vehicle, as its host tells it to the members of one shard.
 
-    cell    where it stands, and `end` where what it holds ends; both may lie in another shard
-    holds   the entries of this shard that it holds, in driving order
+    cell    where it stands, perhaps in another shard
+    end     where what it holds ends, perhaps in another shard
+    holds   its entries of this shard
     ahead   its next cells after `end`
-    wants   where else it could go from its cell, the best first; only while it stands
-    better  how many of those are better than to stay; the others serve to make way
-    age_ms  time for which it has been on its way: the vehicle with the longest goes first
-    keeps   how many cells ahead it keeps: its host gives back those further on once a vehicle waits for them
+    wants   other cells to which it could go, the best first; only while it stands
+    better  number of those which are better than to stay; the others serve to make way
+    age_ms  time on its way: the vehicle with the longest goes first
+    keeps   number of cells ahead which it keeps: its host gives back others once a vehicle waits for them
     """
 
     vehicle: fields.VehicleId
@@ -120,16 +120,17 @@ class HostState(Message, frozen=True, kw_only=True, tag=schema_of("host-state", 
     """All vehicles of a host that hold or request a cell of one shard, sent to one of its members. The newest
     replaces the older.
 
-    generation  number of the host's start (glossary: generation) that sends this; a later start has a greater
-                number
-    knows       number of the newest table that the host has used. It has left or given back every entry which that
+    generation  of the host; a later one is greater
+    knows       stamp of the newest table that the host has used. It has left or given back every entry which that
                 table, or an older one, added and which is not listed in `vehicles`
-    dead        numbers of earlier starts of this host that have certainly ended: they had locked the host's file,
-                which this start has locked now
-    ended       this start of the host has stopped driving, for good
-    never       entries later than `knows` that this start does not hold, and never takes: members asked for them
-    since       seq of an earlier host state: `vehicles` has only the stands that differ from its, and `gone` its
-                vehicles which are not here any more. 0 if `vehicles` has all
+    dead        earlier generations that have certainly ended: they had locked the host's file, which this one has
+                locked now
+    ended       this generation has stopped driving, for good
+    never       entries later than `knows` that this generation does not hold, and never takes: members asked for
+                them
+    since       seq of an earlier host state: `vehicles` has only the stands that differ from its. 0 if `vehicles`
+                has all
+    gone        vehicles of that earlier host state which are not here any more
     """
 
     shard: fields.Shard
@@ -168,7 +169,8 @@ class HostState(Message, frozen=True, kw_only=True, tag=schema_of("host-state", 
 class Entry(msgspec.Struct, frozen=True, array_like=True):
     """A vehicle's place in the order of vehicles for one cell.
 
-    after  the entries before it that the table which says this still lists: the vehicle waits for each
+    number  (cell, epoch, seq)
+    after   (epoch, seq, vehicle) of the entries before it which the table still lists: the vehicle waits for each
     """
 
     number: Number
@@ -194,17 +196,17 @@ class Fence(fields.Bounded, frozen=True, array_like=True):
 
 
 class Table(Message, frozen=True, kw_only=True, tag=schema_of("table", 9)):
-    """All entries (cells granted or waited for) of one shard. Its leader publishes it to the members. In a reply it
-    is what a member has on file. The entries of a cell are in the order of their numbers.
+    """All entries (cells granted or waited for) of one shard, from its leader to the members; in a reply, what a
+    member has on file. The entries of a cell are in the order of their numbers.
 
-    hosts   agent -> [generation, seq] of the newest host state that counts in this table
-    grants  vehicle -> its entries in driving order
-    fences  entries of earlier generations, whose vehicles may still drive
-    pushed  vehicle -> the age with which it is to make way into another shard
-    without agent -> number of its newest revoked certificate (a0~2 is the second of a0). A leader began without
-            that member, with what two of the three others had on file
-    since   stamp of an earlier table of the same epoch, from which this one has the differences only: changed
-            `hosts` and `grants`, which are empty for a vehicle without entries now. None if the table is whole
+    hosts    agent -> [generation, seq] of the newest host state that counts in this table
+    grants   vehicle -> its entries
+    fences   entries of earlier generations, whose vehicles may still drive
+    pushed   vehicle -> the age with which it is to make way into another shard
+    without  agent -> number of its newest revoked certificate (a0~2 is the second of a0). A leader began without
+             that member, with what two of the three others had on file
+    since    stamp of an earlier table of the same epoch, from which this one has the differences only: changed
+             `hosts` and `grants`, which are empty for a vehicle without entries now. None if the table is whole
     """
 
     shard: fields.Shard
@@ -254,13 +256,13 @@ class Stored(Message, frozen=True, kw_only=True, tag=schema_of("stored")):
 class Granted(Message, frozen=True, kw_only=True, tag=schema_of("granted", 9)):
     """Content of a shard's table for one host, once a majority of the shard's members has it on file.
 
-    agent              the shard's leader
-    epoch, seq         of the table
-    generation, heard  the newest host state of the host that counts in the table; 0 if none does
-    grants             vehicle of the host -> its entries
-    waits              vehicle of the host -> those of its entries that wait for others
-    followed           host -> entries of this one behind which its vehicles wait
-    pushed             vehicle of the host -> the age with which it is to make way into another shard
+    agent              the leader
+    epoch, seq         stamp of the table
+    generation, heard  generation and seq of the host's newest host state in the table; 0 if there is none
+    grants             as in `Table`
+    waits              vehicle -> those of its entries that wait for others
+    followed           host -> entries of this host behind which its vehicles wait
+    pushed             as in `Table`
     occupied           cells held by others near the ends of this host's paths
     since              stamp of an earlier table, which the host has used: `grants` has only what differs from it,
                        an empty one for a vehicle that has no entry any more. None if it has all. Sent to hosts
@@ -303,7 +305,7 @@ class Word(Message, frozen=True, kw_only=True, tag=schema_of("word")):
     there a grant counts with the words of a majority.
 
     agent       the member
-    epoch, seq  of the newest table on its file
+    epoch, seq  stamp of its newest table on file
     part        digest of what the table grants to the host
     asks        the member lacks a statement of the host, without which it stores no later table
     lacks       entries of the host that such a table omits: the host disclaims those that it does not hold
@@ -320,8 +322,8 @@ class Word(Message, frozen=True, kw_only=True, tag=schema_of("word")):
 
 
 class Left(Message, frozen=True, kw_only=True, tag=schema_of("left")):
-    """Entries that vehicles of a host have left or given back, for a host whose vehicles wait behind them: a fact
-    for good, so no order, loss or repetition matters."""
+    """Entries that vehicles of a host have left or given back for good, for a host whose vehicles wait behind them.
+    Order, loss and repetition do not matter."""
 
     agent: fields.Id
     host: fields.Id
@@ -329,16 +331,19 @@ class Left(Message, frozen=True, kw_only=True, tag=schema_of("left")):
 
 
 class Claim(Message, frozen=True, kw_only=True, tag=schema_of("claim")):
-    """A member requests to be leader in this epoch: a member that replies with its stored table promises to store
-    none of a lower epoch."""
+    """Claim of a member to be leader in this epoch. A member which replies promises to store no table of a lower
+    epoch."""
 
     epoch: fields.Natural
 
 
 class KnownRequest(Message, frozen=True, kw_only=True, tag=schema_of("known-request")):
-    """A new generation of an agent or an external vehicle asks all agents what they know of it. `disk` names the
-    file that it keeps; an external vehicle's is 0, and is not noted. Only agents of its layer answer: 0 is the
-    ground, 1 the air; an agent is answered only by those whose shards are as large as its own."""
+    """A new generation of an agent or an external vehicle asks all agents what they know of it. Agents with shards
+    of another size do not answer an agent.
+
+    disk   its file; 0 of an external vehicle, and not noted
+    layer  0 ground, 1 air: only agents of this layer answer
+    """
 
     agent: fields.Id
     disk: fields.Natural
@@ -349,15 +354,14 @@ class KnownRequest(Message, frozen=True, kw_only=True, tag=schema_of("known-requ
 class Known(Message, frozen=True, kw_only=True, tag=schema_of("known")):
     """One agent's record of another.
 
-    agent        who answers
-    disk         the file that it knows as the other's: the first that it received
-    generation   the greatest generation in any table
-    shards       those whose tables grant cells to its vehicles, or keep cells of an earlier generation of it shut
+    agent        which replies
+    disk         the other's file: the first that it received
+    generation   the other's greatest one in any table
+    shards       those whose tables grant cells to the other's vehicles, or keep cells of its earlier generations
+                 shut
     agents       for an external vehicle, which may not know the scenario: the agents of which some are members of
                  each shard
-    generations  for an external vehicle: all generations of it that tables name, so that an operator can say that
-                 they have ended
-    shard_cells  side of a shard
+    generations  for an external vehicle: all of its own in tables, so that an operator can say that they have ended
     """
 
     agent: fields.Id

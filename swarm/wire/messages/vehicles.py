@@ -37,12 +37,13 @@ _Place = Annotated[bytes, fields.Column("<f4", per="ids", least=-1e9, most=1e9)]
 
 
 class Fleet(Message, frozen=True, kw_only=True, tag=schema_of("fleet")):
-    """The vehicles of one agent process inside one region, at one instant.
+    """The vehicles of one agent inside one region, at one instant.
 
-    east_m       from the grid's west border; south_m from its north border
+    east_m       from the grid's west border
+    south_m      from its north border
     heading_rad  clockwise from north
     states       VehicleState
-    targets      index into target_ids, NO_TARGET (255) for none
+    targets      index into `target_ids`; 255 for none
     """
 
     author: fields.Id
@@ -66,11 +67,11 @@ class Fleet(Message, frozen=True, kw_only=True, tag=schema_of("fleet")):
 
 
 class Chasers(Message, frozen=True, kw_only=True, tag=schema_of("chasers")):
-    """The vehicles of one agent process that chase one target, or that go to places.
+    """The vehicles of one agent that chase one target, or that go to places.
 
     target  None of those that go to places
     cells   one that each vehicle may stand on or enter, where a new route for it may begin
-    goals   the place of each vehicle, if these go to places
+    goals   cell of each vehicle's place, if they go to places
     """
 
     target: fields.Id | None
@@ -95,7 +96,7 @@ class SharedCosts(Message, frozen=True, kw_only=True, tag=schema_of("shared-cost
     """Costs from the vehicles of one agent to each target, for the other agents of their group.
 
     costs_s  per vehicle and target, the targets of one vehicle side by side; inf where there is no way
-    targets  the one that each vehicle chases, as an index into target_ids, NO_TARGET for none of these
+    targets  index of the chased one in `target_ids`; 255 for none of these
     """
 
     author: fields.Id
@@ -131,9 +132,9 @@ class SharedCosts(Message, frozen=True, kw_only=True, tag=schema_of("shared-cost
 
 
 class Followed(Message, frozen=True, kw_only=True, tag=schema_of("followed")):
-    """The route that a vehicle has just begun to follow, for those who watch.
+    """The route that a vehicle has just begun to follow.
 
-    legs  of a pulled route, as in `Route`; the first begins where the vehicle is, on a segment perhaps
+    legs  as in `Route`; the first begins where the vehicle is, on a segment perhaps
     """
 
     vehicle: fields.VehicleId
@@ -187,18 +188,17 @@ class Obstacle(Message, frozen=True, kw_only=True, tag=schema_of("body")):
 
 
 class RemoveVehicles(Message, frozen=True, kw_only=True, tag=schema_of("remove-vehicles")):
-    """An operator asks an agent to let vehicles leave; all that it hosts if none is named. To ask again is
-    harmless."""
+    """Asks an agent to let vehicles leave; all of its vehicles if none is named. To ask again is harmless."""
 
     vehicles: Annotated[list[fields.VehicleId], fields.SMALL] = []
 
 
 class Removed(Message, frozen=True, kw_only=True, tag=schema_of("removed")):
-    """Result of such a request.
+    """Vehicles that have left an agent.
 
-    left     the vehicles asked for that are gone from the agent
+    left     of those asked for
     unknown  those that it does not host, and has not let leave
-    held     of those that left: how many hold cells that are not known to be free yet
+    held     number of those in `left` with cells that are not known to be free yet
     """
 
     agent: fields.Id

@@ -14,6 +14,7 @@ from docs.generate import scenario_page, wire_page
 from docs.generate.__main__ import command_line
 from launch_scripts import cli
 from launch_scripts.typer_commands import Family
+from swarm.config.explain import meanings
 from swarm.config.scenario import Scenario
 from swarm.wire.topics import TOPICS
 
@@ -45,8 +46,8 @@ class Unexplained(msgspec.Struct):
 
 def test_a_key_has_its_meaning_range_and_default_on_the_page():
     page = scenario_page.document(Explained)
-    assert "| `width_m` | how wide it is | number >0 <=5 | `1.0` |" in page
-    assert '| `shade` | which | text | `""` |' in page
+    assert "- `width_m` (number >0 <=5; `1.0`): how wide it is\n" in page
+    assert '- `shade` (text; `""`): which' in page
 
 
 def test_a_key_without_a_row_is_refused_by_page_and_schema():
@@ -59,9 +60,8 @@ def test_every_key_of_every_section_is_on_the_page():
     page = scenario_page.PATH.read_text(encoding="utf-8")
     for path, section in scenario_page._sections(Scenario):
         assert f"## `{path}`" in page or path == ""
-        for field in msgspec.structs.fields(section):
-            key = field.encode_name
-            assert f"| `{key}` |" in page or f".{key}]" in page or f"[{key}]" in page
+        for key in section.__struct_encode_fields__:
+            assert f"- `{key}` (" in page or f".{key}]" in page or f"[{key}]" in page
 
 
 @pytest.mark.parametrize(
@@ -89,8 +89,7 @@ def test_every_command_and_option_of_the_command_line_is_on_the_page():
     for link, options in zip(("the swarm", "a process"), re.findall(r'" means (.*?)[;.]', page), strict=True):
         page = page.replace(f"[{link}](#shared-options)", options)
     for name, command in cli.command().commands.items():
-        section = page.partition(f"## `swarm {name}`\n")[2].partition("\n## `")[0]
-        assert section
+        section = page.split(f"\n## `swarm {name}`\n")[1].partition("\n## `")[0]
         for param in (each for each in command.params if not getattr(each, "hidden", False)):
             assert any(name in section for name in (*param.opts, param.metavar or param.name.upper()))
         if isinstance(command, Family):
@@ -99,13 +98,14 @@ def test_every_command_and_option_of_the_command_line_is_on_the_page():
 
 def test_every_key_message_and_field_is_on_the_page():
     page = wire_page.document()
-    for topic in TOPICS:
-        assert f"| `{topic.key}` |" in page
-        for message in filter(None, (topic.message, topic.request)):
-            assert f"### {message.__name__}\n" in page
-            assert f'"{message.__struct_config__.tag}"' in page
-            for field in message.__struct_fields__:
-                assert re.search(rf"^    {field} +\S", page, re.MULTILINE)
+    assert all(f"- `{topic.key}` " in page for topic in TOPICS)
+    for message in wire_page.messages():
+        section = page.partition(f"\n### {message.__name__}\n")[2].partition("\n### ")[0]
+        assert f'"{message.__struct_config__.tag}"' in section
+        for field in message.__struct_fields__:
+            assert re.search(rf"^    (\w+, )*{field}(, \w+)*  +\S", section, re.MULTILINE)
+        for struct in (message, *wire_page.parts(message)):
+            assert meanings(struct).keys() <= {*struct.__struct_fields__}
 
 
 _FILE = re.compile(r"`((?:[\w.-]+/)+[\w-]+\.(?:py|toml|md|sh|yml|json))`")
