@@ -244,8 +244,6 @@ def _files_of(incomplete: str) -> Iterator[str]:
 
 # --- a command is run: whatever ends it becomes an exit code and one sentence, never a traceback ----------------
 
-_NOT_MAPPED = "failed to map segment"
-"""What the loader says of a library for which there is no memory."""
 _NO_PATHS = (errno.ENAMETOOLONG, errno.ELOOP, errno.EACCES, errno.EPERM, errno.ENOTDIR)
 """Errors about a path that cannot be one, or not for this user."""
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
@@ -280,10 +278,8 @@ def run_command(command: Callable[[], Any], name: str = "swarm") -> int:
         if package not in EXTRAS:
             raise  # a fault of ours
         return _refused(f"this needs {missing(package)}", ConfigError.exit_code)
-    except (MemoryError, ImportError) as error:
-        if isinstance(error, ImportError) and _NOT_MAPPED not in str(error):
-            raise  # a fault of ours
-        return _refused("this takes more memory than a process here may use (ulimit -v)", SwarmError.exit_code)
+    except MemoryError:
+        return _refused("this takes more memory than a process may use here (ulimit -v)", SwarmError.exit_code)
     except BrokenPipeError:
         discard_output(1)  # the interpreter would complain at its end about what still waits to be printed
         return 0
