@@ -20,7 +20,7 @@ from launch_scripts.deploy.machine_plan import HostsConfig, Plan, make_plan, par
 from launch_scripts.launcher.run_options import as_process, chosen_processes
 from swarm.config.revocations import revoke
 from swarm.config.scenario_files import load_scenario, parse_scenario
-from swarm.errors import ConfigError, StoreError
+from swarm.errors import StoreError
 
 SCENARIO = 'name = "small"\n[[targets]]\ncount = 2\n[[groups]]\nvehicles = 12\n[vehicles]\nper_agent = 3\n'
 ON_GROUND = (
@@ -61,12 +61,10 @@ def lay_ground(folder: Path) -> tuple[str, ...]:
     return own
 
 
-def test_an_address_of_version_6_is_written_in_brackets_and_standbys_need_machines() -> None:
+def test_an_address_of_version_6_is_written_in_brackets() -> None:
     first, other, *_ = planned(machines=hosts("fd00::1", "10.0.0.1", "10.0.0.2")).hosts
     assert "tls/[fd00::1]:7447" in other.connect
     assert first.listen == ("tls/[::]:7447",)
-    with pytest.raises(ConfigError, match="3 machines have the role 'planner', expected 4 or more"):
-        planned(f"{SCENARIO}[standbys]\nplanner = 3\n")
 
 
 def test_each_machine_has_the_keys_of_its_own_processes_and_no_other(tmp_path: Path) -> None:

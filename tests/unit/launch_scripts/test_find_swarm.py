@@ -112,8 +112,6 @@ def test_options_say_more_than_the_run_does(tmp_path: Path, listens: list[int]) 
     assert str(Where(runs=tmp_path)) == f"in namespace 'north' at tcp/127.0.0.1:{listens[0]}"
     given = Where(connect="tcp/127.0.0.1:9", runs=tmp_path).network()
     assert (given.connect, given.namespace) == (("tcp/127.0.0.1:9",), "swarm")
-    with pytest.raises(ConfigError, match="--connect and --run both say which swarm"):
-        Where(connect="tcp/127.0.0.1:9", run="mine", runs=tmp_path).network()
 
 
 def test_a_run_is_found_by_its_name_from_any_folder_until_its_folder_goes(

@@ -32,7 +32,7 @@ from swarm.clock import NS_PER_S
 from swarm.config.ground import CostConfig
 from swarm.config.scenario import TargetConfig, Walk
 from swarm.config.scenario_files import parse_scenario
-from swarm.errors import ConfigError, TerrainError
+from swarm.errors import TerrainError
 from swarm.grid import GridSpec
 from swarm.wire.messages.vehicles import Obstacle
 from vehicle_agent.traffic.obstacles import REACTION_S, capsule_of
@@ -269,8 +269,6 @@ def test_rovers_stand_while_the_run_is_paused() -> None:
     }
 
 
-def test_rovers_need_the_process_that_moves_them_and_names_of_their_own() -> None:
+def test_rovers_need_the_process_that_moves_them() -> None:
     external = parse_scenario(TEXT + '[[targets]]\nwalk = "external"\n')
     assert any(spec.role == "targets" for spec in processes_of(external))
-    with pytest.raises(ConfigError, match="two rovers are called 'r0'"):
-        parse_scenario(TEXT + '[[rovers]]\nname = "r0"\n')
