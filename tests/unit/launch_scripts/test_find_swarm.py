@@ -87,12 +87,6 @@ def test_a_port_that_a_later_run_took_over_is_that_runs(
     )
 
 
-def test_a_stranger_at_the_router_of_an_ended_run_is_not_that_run(tmp_path: Path, listens: list[int]) -> None:
-    make_run(tmp_path, "over", listens[0], over=True)
-    with pytest.raises(BusError, match="no swarm runs here"):
-        find_swarm()
-
-
 def test_what_was_looked_at_is_said_when_nothing_runs(tmp_path: Path) -> None:
     ports = free_ports(5)
     for n, port in enumerate(ports):

@@ -19,7 +19,7 @@ from launch_scripts.check.scenario_check import files_named, one_way_share, plac
 from launch_scripts.simulation.world.walks import TrueTerrain
 from shared_map.terrain.terrain import terrain_of_pace
 from shared_map.vehicle_class_grounds import class_grounds
-from swarm.config.explain import expected, meanings
+from swarm.config.explain import meanings
 from swarm.config.ground import TerrainConfig
 from swarm.config.scenario import PLACE_TREES_BYTES, GroupConfig, Scenario, TargetConfig, Walk, plan_agents
 from swarm.config.scenario_files import commented, load_scenario, parse_scenario, read_scenario
@@ -332,7 +332,3 @@ def test_the_memory_of_routes_to_places_is_the_budget_of_trees_and_a_tree_in_han
     )
     least = PLACE_TREES_BYTES + 2 * 20 * 2048**2
     assert least < with_places.memory_bytes - lone.memory_bytes < least + (128 << 20)
-
-
-def test_a_choice_is_said_with_all_that_it_allows() -> None:
-    assert expected(typing.Literal["a", "b"] | None) == "one of 'a', 'b'"

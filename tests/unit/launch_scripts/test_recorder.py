@@ -16,7 +16,7 @@ from launch_scripts.launcher.console import plain_line
 from launch_scripts.observe import run_state as facts
 from launch_scripts.observe.alarms import Alarm as SeenAlarm
 from launch_scripts.observe.latest_messages import LatestState, plan_of
-from launch_scripts.observe.recorder import BegunRoute, Recorder, Sampling, Thinned
+from launch_scripts.observe.recorder import BegunRoute, Recorder, Sampling
 from launch_scripts.observe.summed_counts import CertifiedGap
 from swarm.clock import NS_PER_S
 from swarm.config.scenario import Scenario, StandbyConfig
@@ -366,15 +366,7 @@ def test_of_a_target_that_only_vehicles_see_its_planner_tells_whether_it_is_lost
 
 
 def test_the_run_is_ready_when_all_processes_are_alive_and_a_vehicle_has_a_route(recorder: Recorder) -> None:
-    peers = [
-        ("keeper", "k0"),
-        ("targets", "d0"),
-        ("planner", "t0"),
-        ("planner", "t1"),
-        ("agent", "a0"),
-        ("agent", "a1"),
-    ]
-    for n, (role, id) in enumerate(peers):
+    for n, (role, id) in enumerate(recorder.observed.plan.crew):
         assert recorder.ready_ns is None
         recorder.alive(Peer(role, id, 1), True, n)
     assert recorder.observed.missing() == []
@@ -397,17 +389,6 @@ def test_messages_per_second_are_what_the_processes_that_live_say(recorder: Reco
     assert recorder.summary(3 * NS_PER_S).messages_now_per_s == 25.0
 
 
-def test_tracks_forget_every_second_sampling_instead_of_growing() -> None:
-    samplings = Thinned[Sampling](100, lambda sampling: len(sampling.keys))
-    for now_ns in range(1000):
-        samplings.add(Sampling(now_ns, (("a", 0), ("b", 0)), np.full((2, 2), now_ns, np.float32)))
-    times_ns = [each.time_ns for each in samplings.kept]
-    assert 25 <= len(times_ns) <= 51
-    assert all((each.places_m == each.time_ns).all() for each in samplings.kept)
-    assert (times_ns[0], times_ns[-1] > 900) == (0, True)
-    assert (np.diff(times_ns) > 0).all()
-
-
 def test_a_run_of_a_day_takes_no_more_memory_than_one_of_an_hour(monkeypatch: pytest.MonkeyPatch) -> None:
     """The size of a recorder by its own lists: captures, samples and places are all bounded."""
     monkeypatch.setattr("launch_scripts.observe.recorder._CAPTURES_KEPT", 128)
@@ -428,28 +409,21 @@ def test_a_run_of_a_day_takes_no_more_memory_than_one_of_an_hour(monkeypatch: py
     assert len(recorder.captures) == recorder.captures.maxlen
 
 
-def test_routes_take_no_more_memory_than_is_counted_for_them(recorder: Recorder) -> None:
-    said = (
-        Followed(vehicle="a0-0", target="t", start=n, directions=bytes(n), cost_s=n, lower_bound_s=n)
-        for n in range(90)
-    )
-    sent = [encode(each) for each in said]
+def test_routes_and_tracks_take_no_more_memory_than_is_counted_for_them(recorder: Recorder) -> None:
+    route = Followed(vehicle="a0-0", target="t", start=0, directions=b"", cost_s=1.0, lower_bound_s=1.0)
+    sent = [encode(msgspec.structs.replace(route, start=n, directions=bytes(n))) for n in range(90)]
+    keys = tuple((f"t{n}", 0) for n in range(4))
+    began = 10**18
     tracemalloc.start()
-    for at_ns, payload in enumerate(sent * 9, 10**18):
+    for at_ns, payload in enumerate(sent * 9, began):
         recorder.routes.add(BegunRoute(at_ns, decode(payload, Followed)))
+    routes_took, _ = tracemalloc.get_traced_memory()
+    for at_ns in range(began, began + 5000):
+        recorder.target_tracks.add(Sampling(at_ns, keys, np.zeros((4, 2), np.float32)))
     took, _ = tracemalloc.get_traced_memory()
     tracemalloc.stop()
-    assert took < 1.2 * recorder.routes._total
-
-
-def test_tracks_take_no_more_memory_than_is_counted_for_them(recorder: Recorder) -> None:
-    keys, tracks = tuple((f"t{n}", 0) for n in range(4)), recorder.target_tracks
-    tracemalloc.start()
-    for at_ns in range(10**18, 10**18 + 5000):
-        tracks.add(Sampling(at_ns, keys, np.zeros((4, 2), np.float32)))
-    took, _ = tracemalloc.get_traced_memory()
-    tracemalloc.stop()
-    assert took < 1.2 * 8 * tracks._total  # a place is two floats of 4 bytes
+    assert routes_took < 1.2 * recorder.routes._total
+    assert took - routes_took < 1.2 * 8 * recorder.target_tracks._total  # a place is two floats of 4 bytes
 
 
 def told(kind: str, about: str, since_s: float, over_s: float | None = None) -> Alarm:
