@@ -58,9 +58,13 @@ EXPOSURE = 15
 """Tenths, in the words of `systemd-analyze security`, of 100; newer versions may count more."""
 
 
+def rows(*addresses: str) -> str:
+    """The text of a file of hosts, called m0, m1 and so on."""
+    return "".join(f'[[hosts]]\nname = "m{n}"\naddress = "{address}"\n' for n, address in enumerate(addresses))
+
+
 def hosts(*addresses: str) -> HostsConfig:
-    rows = (f'[[hosts]]\nname = "m{n}"\naddress = "{address}"\n' for n, address in enumerate(addresses))
-    return parse_hosts("".join(rows))
+    return parse_hosts(rows(*addresses))
 
 
 THREE = hosts("10.0.0.1", "10.0.0.2", "10.0.0.3")
@@ -303,13 +307,12 @@ def test_a_machine_of_containers_has_all_that_its_compose_file_names_and_no_laun
 ) -> None:
     lay_ground(tmp_path)
     (tmp_path / "small.toml").write_text(ON_GROUND)
-    machines = (f'[[hosts]]\nname = "{name}"\naddress = "10.0.0.{n}"\n' for n, name in enumerate(("base", "north")))
-    (tmp_path / "hosts.toml").write_text("".join(machines))
+    (tmp_path / "hosts.toml").write_text(rows("10.0.0.1", "10.0.0.2"))
     (tmp_path / "swarm.whl").write_bytes(b"")
     line = f"deploy plan {tmp_path}/small.toml --hosts {tmp_path}/hosts.toml --out {tmp_path}/kits --kit compose"
     assert "--wheel: found" in swarm(f"{line} --wheel {tmp_path}/swarm.whl")[2], "containers have an image"
     assert swarm(line)[0] == 0
-    for host in ("base", "north"):
+    for host in ("m0", "m1"):
         with tarfile.open(tmp_path / "kits" / f"{host}.tar.gz") as archive:
             archive.extractall(tmp_path, filter="data")
         kit = tmp_path / f"swarm-{host}"
@@ -380,25 +383,10 @@ def test_every_process_of_a_scenario_gets_a_certificate_and_finds_its_own(
         as_process(loaded, "keeper", "west")
 
 
-def test_what_is_there_stays_and_a_revoked_name_gets_its_next_number(
-    tmp_path: Path, scenario: Path, swarm: Swarm
-) -> None:
-    certs, revoked = tmp_path / "certs", "agent.all.a0"
-    swarm("deploy certs", certs, "--scenario", scenario)
-    before = {path: path.read_bytes() for path in certs.iterdir()}
-    assert swarm("deploy certs", certs, "--scenario", scenario)[0] == 0
-    assert {path: path.read_bytes() for path in certs.iterdir()} == before
-    scenario.write_text(scenario.read_text() + f'revoked = ["{revoked}"]\n')
-    assert swarm("deploy certs", certs, "--scenario", scenario)[0] == 0
-    assert called_of(certs / f"{revoked}.pem") == f"{revoked}~2"
-    changed = {path.stem for path, was in before.items() if path.read_bytes() != was}
-    assert changed == {revoked}
-
-
-def test_what_a_scenario_needs_and_ends_soon_is_made_again_with_the_hosts_that_it_had(
+def test_what_a_scenario_needs_is_made_again_if_it_ends_soon_with_the_hosts_that_it_had_or_is_revoked(
     tmp_path: Path, scenario: Path, swarm: Swarm, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    certs = tmp_path / "certs"
+    certs, revoked = tmp_path / "certs", "agent.all.a0"
     with monkeypatch.context() as earlier:
         earlier.setattr(certificates, "_CLOCKS_DIFFER", datetime.timedelta(days=20))
         swarm(
@@ -412,6 +400,13 @@ def test_what_a_scenario_needs_and_ends_soon_is_made_again_with_the_hosts_that_i
     assert hosts_of(certs / "router.0.pem") == {"10.0.0.1", "base.local", *THIS_MACHINE}
     for name in before:
         check_signed(certs / "ca.pem", certs / f"{name}.pem", certs / f"{name}.key")
+    made = {path: path.read_bytes() for path in certs.iterdir()}
+    assert swarm("deploy certs", certs, "--scenario", scenario)[0] == 0
+    assert {path: path.read_bytes() for path in certs.iterdir()} == made
+    scenario.write_text(scenario.read_text() + f'revoked = ["{revoked}"]\n')
+    assert swarm("deploy certs", certs, "--scenario", scenario)[0] == 0
+    assert called_of(certs / f"{revoked}.pem") == f"{revoked}~2"
+    assert {path.stem for path, was in made.items() if path.read_bytes() != was} == {revoked}
 
 
 def test_zenohd_admits_the_processes_of_a_scenario_and_needs_certificates(
@@ -432,20 +427,19 @@ def test_zenohd_admits_the_processes_of_a_scenario_and_needs_certificates(
 
 
 def test_a_plan_is_shown_and_written_for_each_machine(tmp_path: Path, scenario: Path, swarm: Swarm) -> None:
-    machines = "".join(f'[[hosts]]\nname = "m{n}"\naddress = "10.0.0.{n}"\n' for n in (1, 2, 3))
     hosts, kits = tmp_path / "hosts.toml", tmp_path / "kits"
-    hosts.write_text(machines)
+    hosts.write_text(rows("10.0.0.1", "10.0.0.2", "10.0.0.3"))
     code, shown, _ = swarm("deploy plan", scenario, "--hosts", hosts)
     assert code == 0
-    assert {"m1", "m2", "m3"} <= set(shown.split())
+    assert {"m0", "m1", "m2"} <= set(shown.split())
     assert "the run survives the loss of any 1 of its 3 machines; the vehicles of a lost machine stop" in shown
     assert " records the run and writes its report" in shown
     assert not kits.exists()
     plan = json.loads(swarm("deploy plan", scenario, "--hosts", hosts, "--out", kits, "--json")[1])
-    assert plan["archives"] == [str(kits / f"m{n}.tar.gz") for n in (1, 2, 3)]
+    assert plan["archives"] == [str(kits / f"m{n}.tar.gz") for n in range(3)]
     names = [process["certificate"] for host in plan["hosts"] for process in host["processes"]]
     assert {path.stem for path in (kits / "certs").glob("*.key")} == {
-        "ca", "operator.0", *(f"operator.m{n}" for n in (1, 2, 3)), *names,
+        "ca", "operator.0", *(f"operator.m{n}" for n in range(3)), *names,
     }  # fmt: skip
     assert "operator.anna" not in names
 

@@ -76,6 +76,12 @@ def rolled(yaw: float, pitch: float, roll: float) -> tuple[float, float, float, 
     )
 
 
+@given(st.tuples(*[st.floats()] * 4))
+def test_no_quaternion_of_others_raises(quaternion: tuple[float, float, float, float]) -> None:
+    heading = heading_of_quaternion(*quaternion)
+    assert heading is None or 0 <= heading < math.tau
+
+
 @given(npst.arrays(np.float64, st.tuples(st.integers(0, 12), st.just(2)), elements=st.integers(-3, 3)))
 def test_headings_along_a_line_lead_to_the_next_point(points: np.ndarray[Any, np.dtype[np.float64]]) -> None:
     headings = headings_along(points)
