@@ -230,38 +230,14 @@ def test_an_external_target_is_not_driven_but_can_be_caught() -> None:
     assert world.hear(cell) == []
 
 
-def stand_by(leader: World, **fields: Any) -> World:
-    """A standby that has heard what a leader tells."""
-    standby = World(still(**fields))
-    standby.world.lead(False)
-    for pose in leader.poses().values():
-        standby.world.hear_pose(pose, standby.now_ns)
-    return standby
-
-
-def test_a_standby_does_nothing_and_goes_on_from_where_the_leader_ended() -> None:
-    leader = World(still(), incarnation=9)
-    leader.settle()
-    cell = leader.world._targets["t"].walker.cell
-    assert leader.hear(cell) != []
-    standby = stand_by(leader)
-    assert standby.tick() == []
-    assert standby.world.ready
-    assert standby.hear(cell) == []
-    last = leader.poses()["t"]
-    standby.world.hear_pose(last, standby.now_ns)
-    standby.world.lead(True)
-    first = standby.poses()["t"]
-    assert (first.cell, first.captures, first.jumps) == (last.cell, 1, 1)
-    assert (first.incarnation, first.seq) > (last.incarnation, last.seq)
-
-
 def test_a_capture_that_the_leader_counted_counts_once_after_it_is_gone() -> None:
     leader = World(still(caught="stay"), incarnation=9)
     leader.settle()
     cell = leader.world._targets["t"].walker.cell
     assert leader.hear(cell) == [Captured("t", "v", cell)]
-    standby = stand_by(leader, caught="stay")
+    standby = World(still(caught="stay"))
+    standby.world.lead(False)
+    standby.world.hear_pose(leader.poses()["t"], standby.now_ns)
     standby.world.lead(True)
     assert standby.hear(cell) == []
     assert standby.poses()["t"].captures == 1
