@@ -19,7 +19,7 @@ from launch_scripts.check.scenario_check import files_named, one_way_share, plac
 from launch_scripts.simulation.world.walks import TrueTerrain
 from shared_map.terrain.terrain import terrain_of_pace
 from shared_map.vehicle_class_grounds import class_grounds
-from swarm.config.explain import meanings
+from swarm.config.explain import expected, meanings
 from swarm.config.ground import TerrainConfig
 from swarm.config.scenario import PLACE_TREES_BYTES, GroupConfig, Scenario, TargetConfig, Walk, plan_agents
 from swarm.config.scenario_files import commented, load_scenario, parse_scenario, read_scenario
@@ -161,22 +161,13 @@ def test_more_shards_than_agents_have_use_for_are_a_warning_with_what_to_set() -
 
 
 def test_all_keys_that_are_wrong_are_named_each_once_and_missing_files_beside_them() -> None:
-    text = """
+    triangle = "polygon_m = [[1, 1], [2, 2], [3, 3]]"
+    text = f"""
 seed = -1
 secnds = 3
-[terrain]
-source = "none.tif"
-rodes = 4
-[[cost.zones]]
-kind = "forbiden"
-polygon_m = [[1, 1], [2, 2], [3, 3]]
-[[cost.zones]]
-polygon_m = [[1, 1], [2, 2], [3, 3]]
-[[groups]]
-vehicles = 0
-[[groups]]
-vehicles = 1.5
-start = "heap"
+terrain = {{ source = "none.tif", rodes = 4 }}
+cost.zones = [{{ kind = "forbiden", {triangle} }}, {{ {triangle} }}]
+groups = [{{ vehicles = 0 }}, {{ vehicles = 1.5, start = "heap" }}]
 """
     scenario, faults, _ = read_scenario(text, "s.toml")
     assert scenario is not None
@@ -332,3 +323,7 @@ def test_the_memory_of_routes_to_places_is_the_budget_of_trees_and_a_tree_in_han
     )
     least = PLACE_TREES_BYTES + 2 * 20 * 2048**2
     assert least < with_places.memory_bytes - lone.memory_bytes < least + (128 << 20)
+
+
+def test_a_choice_is_said_with_all_that_it_allows() -> None:
+    assert expected(typing.Literal["a", "b"] | None) == "one of 'a', 'b'"

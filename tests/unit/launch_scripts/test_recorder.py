@@ -16,7 +16,7 @@ from launch_scripts.launcher.console import plain_line
 from launch_scripts.observe import run_state as facts
 from launch_scripts.observe.alarms import Alarm as SeenAlarm
 from launch_scripts.observe.latest_messages import LatestState, plan_of
-from launch_scripts.observe.recorder import BegunRoute, Recorder, Sampling
+from launch_scripts.observe.recorder import BegunRoute, Recorder, Sampling, Thinned
 from launch_scripts.observe.summed_counts import CertifiedGap
 from swarm.clock import NS_PER_S
 from swarm.config.scenario import Scenario, StandbyConfig
@@ -383,6 +383,17 @@ def test_messages_per_second_are_what_the_processes_that_live_say(recorder: Reco
     assert recorder.report()["messages_per_s"] == pytest.approx(50.0, rel=0.2)
     recorder.alive(Peer("agent", "a1", 1), False, 3 * NS_PER_S)
     assert recorder.summary(3 * NS_PER_S).messages_now_per_s == 25.0
+
+
+def test_tracks_forget_every_second_sampling_instead_of_growing() -> None:
+    samplings = Thinned[Sampling](100, lambda sampling: len(sampling.keys))
+    for now_ns in range(1000):
+        samplings.add(Sampling(now_ns, (("a", 0), ("b", 0)), np.full((2, 2), now_ns, np.float32)))
+    times_ns = [each.time_ns for each in samplings.kept]
+    assert 25 <= len(times_ns) <= 51
+    assert all((each.places_m == each.time_ns).all() for each in samplings.kept)
+    assert (times_ns[0], times_ns[-1] > 900) == (0, True)
+    assert (np.diff(times_ns) > 0).all()
 
 
 def test_a_run_of_a_day_takes_no_more_memory_than_one_of_an_hour(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -494,14 +494,7 @@ def test_a_jump_leads_far_away_and_clear_of_vehicles() -> None:
 # --- simulated rovers ---------------------------------------------------------------------------------------------
 
 GRID = GridSpec(30, 30, 10.0)
-TEXT = """
-seed = 4
-time_scale = 2
-[[rovers]]
-count = 6
-speed_m_per_s = 3
-radius_m = 2
-"""
+TEXT = "seed = 4\ntime_scale = 2\nrovers = [{ count = 6, speed_m_per_s = 3, radius_m = 2 }]\n"
 
 
 def ground() -> TrueTerrain:
