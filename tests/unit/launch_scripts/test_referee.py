@@ -215,7 +215,7 @@ HITS: dict[str, tuple[list[tuple[int, Any]], str, str]] = {
         [*standing(1000, 3000, 5.5), *on(50, 300, 4), *on(2050, 3000, 5)], "hit_by_obstacles", "obstacle r1",
     ),
 }  # fmt: skip
-"""What happens -> the reports, who is at fault, and the begin of the sentence."""
+"""Happening -> the reports, who is at fault, and the begin of the sentence."""
 
 
 @pytest.mark.parametrize("what", HITS)

@@ -4,6 +4,7 @@ import csv
 import json
 import re
 import sqlite3
+from collections.abc import Callable
 from concurrent.futures import Future
 from datetime import datetime
 from functools import partial
@@ -248,42 +249,38 @@ def ask(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Any:
     monkeypatch.setattr(client, "time", clock)
     monkeypatch.setattr(swarm_route, "time", clock)
 
-    def by_client(info: RunInfo, silent: int) -> tuple[int, int]:
-        asked: list[Any] = []
-
+    def by_client(info: RunInfo, replies: Callable[[], list[PlaceRouteReply]]) -> int:
         def answers(*_: object) -> list[PlaceRouteReply]:
-            if len(asked) <= silent:
+            if not (found := replies()):
                 raise NoAnswerError("no process answers")
-            return [REPLY]
+            return found
 
-        def ask(*_: object, **__: object) -> Future[Any]:
-            asked.append(1)
-            return Future()
-
-        number = partial(Session.number, SimpleNamespace())
         session: Any = SimpleNamespace(
-            run=info, frame=Frame.of(info), ask=ask, answers=answers, number=number, check_ids=lambda **_: None
-        )
-        route = client.Swarm(session).route((5.0, -5.0), (15.0, -5.0))
-        return route.cells[-1], len(asked)
+            run=info, frame=Frame.of(info), ask=lambda *_, **__: Future(), answers=answers,
+            number=partial(Session.number, SimpleNamespace()), check_ids=lambda **_: None,
+        )  # fmt: skip
+        return client.Swarm(session).route((5.0, -5.0), (15.0, -5.0)).cells[-1]
 
-    def by_command(info: RunInfo, silent: int) -> tuple[int, int]:
-        asked: list[Any] = []
-
-        def replies_to(*_: object, **__: object) -> tuple[list[PlaceRouteReply], None]:
-            asked.append(1)
-            return ([] if len(asked) <= silent else [REPLY]), None
-
-        monkeypatch.setattr(swarm_route, "replies_to", replies_to)
+    def by_command(info: RunInfo, replies: Callable[[], list[PlaceRouteReply]]) -> int:
+        monkeypatch.setattr(swarm_route, "replies_to", lambda *_, **__: (replies(), None))
         monkeypatch.setattr(swarm_route, "ask_run", lambda _: [info])
         monkeypatch.setattr(swarm_route, "frame_of_run", lambda *_: Frame.of(info))
         bus: Any = None
         where: Any = SimpleNamespace(plans_no_places="no process plans routes to places here")
         start, end = read_place("cell:0,0", "from"), read_place("cell:0,1", "to")
-        answer = swarm_route.ask_place(bus, where, start, end, "ground")
-        return answer.path()[-1], len(asked)
+        return swarm_route.ask_place(bus, where, start, end, "ground").path()[-1]
 
-    return by_client if request.param == "client" else by_command
+    def ask(info: RunInfo, silent: int) -> tuple[int, int]:
+        asked: list[int] = []
+
+        def replies() -> list[PlaceRouteReply]:
+            asked.append(1)
+            return [] if len(asked) <= silent else [REPLY]
+
+        end = (by_client if request.param == "client" else by_command)(info, replies)
+        return end, len(asked)
+
+    return ask
 
 
 def test_while_another_takes_over_a_route_to_a_place_is_asked_for_again(ask: Any) -> None:
@@ -300,11 +297,8 @@ def test_a_process_that_never_answers_is_named_and_one_that_no_run_needs_is_aske
 # --- the commands that look at terrains, as a user runs them ------------------------------------------------------
 
 
-runner = CliRunner()
-
-
 def run(*words: object) -> str:
-    result = runner.invoke(app, [str(word) for word in words], catch_exceptions=False)
+    result = CliRunner().invoke(app, [str(word) for word in words], catch_exceptions=False)
     assert result.exit_code == 0, result.output
     return result.output
 
