@@ -1,26 +1,54 @@
 """The archives of `swarm deploy plan`: each machine gets its own files, and its start files are sound."""
 
 import datetime
+import json
 import re
 import shutil
 import stat
 import subprocess
 import sys
 import tarfile
+from collections.abc import Collection, Mapping
 from pathlib import Path
+from typing import Any
 
+import msgspec
 import pytest
 import yaml
+from cryptography import x509
 from support.command import Swarm
 
+from launch_scripts.commands.shared_options import Tls
 from launch_scripts.deploy import certificates
-from launch_scripts.deploy.certificates import authority, called_of, check_signed, ends_on, hosts_of, issue
-from launch_scripts.deploy.machine_archives import UNIT, keep_plan, keepers_before, systemd_files, write_kits
+from launch_scripts.deploy.certificates import (
+    THIS_MACHINE,
+    authority,
+    called_of,
+    check_signed,
+    ends_on,
+    hosts_of,
+    issue,
+)
+from launch_scripts.deploy.machine_archives import (
+    UNIT,
+    keep_plan,
+    keepers_before,
+    systemd_files,
+    write_kits,
+    zenohd_config,
+)
 from launch_scripts.deploy.machine_plan import HostsConfig, Plan, make_plan, parse_hosts
 from launch_scripts.launcher.run_options import as_process, chosen_processes
+from launch_scripts.process_table import LAUNCHER, certificate_name, certificate_names, processes_of
+from launch_scripts.simulation.sample_worlds import SMALL
+from launch_scripts.simulation.simulate import Simulation
+from swarm.bus.memory_bus import MemoryBus
+from swarm.bus.zenoh_config import access_control, bearer, common_name, low_pass_filter
 from swarm.config.revocations import revoke
+from swarm.config.scenario import GroupConfig, NetworkConfig, Scenario, StandbyConfig, TargetConfig, TlsConfig
 from swarm.config.scenario_files import load_scenario, parse_scenario
 from swarm.errors import ConfigError, StoreError
+from swarm.wire.topics import Topic
 
 SCENARIO = 'name = "small"\n[[targets]]\ncount = 2\n[[groups]]\nvehicles = 12\n[vehicles]\nper_agent = 3\n'
 ON_GROUND = (
@@ -30,9 +58,13 @@ EXPOSURE = 15
 """Tenths, in the words of `systemd-analyze security`, of 100; newer versions may count more."""
 
 
+def rows(*addresses: str) -> str:
+    """The text of a file of hosts, called m0, m1 and so on."""
+    return "".join(f'[[hosts]]\nname = "m{n}"\naddress = "{address}"\n' for n, address in enumerate(addresses))
+
+
 def hosts(*addresses: str) -> HostsConfig:
-    rows = (f'[[hosts]]\nname = "m{n}"\naddress = "{address}"\n' for n, address in enumerate(addresses))
-    return parse_hosts("".join(rows))
+    return parse_hosts(rows(*addresses))
 
 
 THREE = hosts("10.0.0.1", "10.0.0.2", "10.0.0.3")
@@ -61,12 +93,10 @@ def lay_ground(folder: Path) -> tuple[str, ...]:
     return own
 
 
-def test_an_address_of_version_6_is_written_in_brackets_and_standbys_need_machines() -> None:
+def test_an_address_of_version_6_is_written_in_brackets() -> None:
     first, other, *_ = planned(machines=hosts("fd00::1", "10.0.0.1", "10.0.0.2")).hosts
     assert "tls/[fd00::1]:7447" in other.connect
     assert first.listen == ("tls/[::]:7447",)
-    with pytest.raises(ConfigError, match="3 machines have the role 'planner', expected 4 or more"):
-        planned(f"{SCENARIO}[standbys]\nplanner = 3\n")
 
 
 def test_each_machine_has_the_keys_of_its_own_processes_and_no_other(tmp_path: Path) -> None:
@@ -248,12 +278,9 @@ def analyze(tmp_path: Path, *arguments: str) -> subprocess.CompletedProcess[str]
     )
 
 
-def test_systemd_finds_nothing_wrong_with_the_unit(tmp_path: Path) -> None:
+def test_systemd_finds_the_unit_sound_and_shut_off_from_the_rest_of_the_machine(tmp_path: Path) -> None:
     done = analyze(tmp_path, "verify", "--man=no")
     assert (done.returncode, done.stdout + done.stderr) == (0, "")
-
-
-def test_the_service_is_shut_off_from_the_rest_of_the_machine(tmp_path: Path) -> None:
     done = analyze(tmp_path, "security", "--offline=true", "--no-pager", f"--threshold={EXPOSURE}")
     assert done.returncode == 0, done.stdout + done.stderr
 
@@ -277,13 +304,12 @@ def test_a_machine_of_containers_has_all_that_its_compose_file_names_and_no_laun
 ) -> None:
     lay_ground(tmp_path)
     (tmp_path / "small.toml").write_text(ON_GROUND)
-    machines = (f'[[hosts]]\nname = "{name}"\naddress = "10.0.0.{n}"\n' for n, name in enumerate(("base", "north")))
-    (tmp_path / "hosts.toml").write_text("".join(machines))
+    (tmp_path / "hosts.toml").write_text(rows("10.0.0.1", "10.0.0.2"))
     (tmp_path / "swarm.whl").write_bytes(b"")
     line = f"deploy plan {tmp_path}/small.toml --hosts {tmp_path}/hosts.toml --out {tmp_path}/kits --kit compose"
     assert "--wheel: found" in swarm(f"{line} --wheel {tmp_path}/swarm.whl")[2], "containers have an image"
     assert swarm(line)[0] == 0
-    for host in ("base", "north"):
+    for host in ("m0", "m1"):
         with tarfile.open(tmp_path / "kits" / f"{host}.tar.gz") as archive:
             archive.extractall(tmp_path, filter="data")
         kit = tmp_path / f"swarm-{host}"
@@ -305,3 +331,225 @@ def test_a_machine_of_containers_has_all_that_its_compose_file_names_and_no_laun
                 assert hosts_of(Path(tls.certificate)) >= {f"router-{host}"}
         assert stat.S_IMODE((kit / "install").stat().st_mode) == 0o755
         assert subprocess.run(["sh", "-n", kit / "install"], timeout=20).returncode == 0
+
+
+# --- the commands: a certificate for each process of a scenario, a configuration for zenohd, a sentence per fault -
+
+
+ADMITTING = """
+terrain.source = "synthetic"
+targets = [{ count = 2 }]
+groups = [{ vehicles = 30 }]
+[network]
+admit = ["operator.anna"]
+"""
+
+
+@pytest.fixture
+def scenario(tmp_path: Path) -> Path:
+    path = tmp_path / "my.toml"
+    path.write_text(ADMITTING)
+    return path
+
+
+def test_every_process_of_a_scenario_gets_a_certificate_and_finds_its_own(
+    tmp_path: Path, scenario: Path, swarm: Swarm
+) -> None:
+    certs = tmp_path / "certs"
+    assert swarm("deploy certs", certs, "--scenario", scenario, "router.0=10.0.0.1")[0] == 0
+    loaded = load_scenario(scenario)
+    names = certificate_names(loaded)
+    assert {path.stem for path in certs.glob("*.pem")} == {"ca", *names}
+    assert {called_of(certs / f"{name}.pem") for name in names} == set(names)
+    router = x509.load_pem_x509_certificate((certs / "router.0.pem").read_bytes())
+    hosts = router.extensions.get_extension_for_class(x509.SubjectAlternativeName).value
+    assert [str(host.value) for host in hosts] == ["10.0.0.1", "localhost", "127.0.0.1"]
+    assert not router.extensions.get_extension_for_class(x509.BasicConstraints).value.ca
+    assert 364 <= (router.not_valid_after_utc - datetime.datetime.now(datetime.UTC)).days <= 365
+    files = Tls(None, str(certs / "ca.pem"), str(certs), str(certs)).tls()
+    scenario.write_text(
+        scenario.read_text() + f'tls = {{ca = "{files.ca}", certificate = "certs", key = "certs"}}\n'
+    )
+    loaded = load_scenario(scenario)
+    for spec in processes_of(loaded):
+        own = as_process(loaded, spec.role, spec.id).network.tls
+        assert called_of(Path(own.certificate)) in names
+        assert Path(own.key) == Path(own.certificate).with_suffix(".key")
+    assert as_process(loaded, LAUNCHER, "0").network.tls != as_process(loaded, "keeper", "0").network.tls
+    with pytest.raises(ConfigError, match=r"certs/keeper.west.pem, which keeper.west needs"):
+        as_process(loaded, "keeper", "west")
+
+
+def test_what_a_scenario_needs_is_made_again_if_it_ends_soon_with_the_hosts_that_it_had_or_is_revoked(
+    tmp_path: Path, scenario: Path, swarm: Swarm, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    certs, revoked = tmp_path / "certs", "agent.all.a0"
+    with monkeypatch.context() as earlier:
+        earlier.setattr(certificates, "_CLOCKS_DIFFER", datetime.timedelta(days=20))
+        swarm(
+            "deploy certs", certs, "router.0=10.0.0.1,base.local", "keeper.0", "--days", 9
+        )  # less than a third is left
+        swarm("deploy certs", certs, "planner.t0", "--days", 11)
+    before = {path.stem: path.read_bytes() for path in certs.glob("*.pem")}
+    assert swarm("deploy certs", certs, "--scenario", scenario)[0] == 0
+    changed = {name for name, was in before.items() if (certs / f"{name}.pem").read_bytes() != was}
+    assert changed == {"router.0", "keeper.0"}
+    assert hosts_of(certs / "router.0.pem") == {"10.0.0.1", "base.local", *THIS_MACHINE}
+    for name in before:
+        check_signed(certs / "ca.pem", certs / f"{name}.pem", certs / f"{name}.key")
+    made = {path: path.read_bytes() for path in certs.iterdir()}
+    assert swarm("deploy certs", certs, "--scenario", scenario)[0] == 0
+    assert {path: path.read_bytes() for path in certs.iterdir()} == made
+    scenario.write_text(scenario.read_text() + f'revoked = ["{revoked}"]\n')
+    assert swarm("deploy certs", certs, "--scenario", scenario)[0] == 0
+    assert called_of(certs / f"{revoked}.pem") == f"{revoked}~2"
+    assert {path.stem for path, was in made.items() if path.read_bytes() != was} == {revoked}
+
+
+def test_zenohd_admits_the_processes_of_a_scenario_and_needs_certificates(
+    tmp_path: Path, scenario: Path, swarm: Swarm
+) -> None:
+    certs, out = tmp_path / "certs", tmp_path / "zenohd.json5"
+    swarm("deploy certs", certs, "--scenario", scenario)
+    files = ("--tls-ca", certs / "ca.pem", "--tls-cert", certs, "--tls-key", certs)
+    told = swarm("deploy zenohd --out", out, "--listen", "tls/0.0.0.0:7447", *files)
+    assert told[0] == 2
+    assert swarm("deploy zenohd --out", out, "--listen", "tls/0.0.0.0:7447", *files, "--scenario", scenario)[0] == 0
+    config = json.loads(out.read_text())
+    named = {name for each in config["access_control"]["subjects"] for name in each.get("cert_common_names", ())}
+    assert named == set(certificate_names(load_scenario(scenario)))
+    assert config["transport"]["link"]["tls"]["listen_certificate"] == str(certs / "router.0.pem")
+    assert swarm("deploy zenohd --out", out, "--force", "--listen", "tcp/127.0.0.1:7447")[0] == 0
+    assert "access_control" not in json.loads(out.read_text())
+
+
+def test_a_plan_is_shown_and_written_for_each_machine(tmp_path: Path, scenario: Path, swarm: Swarm) -> None:
+    hosts, kits = tmp_path / "hosts.toml", tmp_path / "kits"
+    hosts.write_text(rows("10.0.0.1", "10.0.0.2", "10.0.0.3"))
+    code, shown, _ = swarm("deploy plan", scenario, "--hosts", hosts)
+    assert code == 0
+    assert {"m0", "m1", "m2"} <= set(shown.split())
+    assert "the run survives the loss of any 1 of its 3 machines; the vehicles of a lost machine stop" in shown
+    assert " records the run and writes its report" in shown
+    assert not kits.exists()
+    plan = json.loads(swarm("deploy plan", scenario, "--hosts", hosts, "--out", kits, "--json")[1])
+    assert plan["archives"] == [str(kits / f"m{n}.tar.gz") for n in range(3)]
+    names = [process["certificate"] for host in plan["hosts"] for process in host["processes"]]
+    assert {path.stem for path in (kits / "certs").glob("*.key")} == {
+        "ca", "operator.0", *(f"operator.m{n}" for n in range(3)), *names,
+    }  # fmt: skip
+    assert "operator.anna" not in names
+
+
+# --- access control on paper: what processes do is what the table grants them, and names are what they must be ----
+
+
+TLS = TlsConfig(ca="ca.pem", certificate="router.0.pem", key="router.0.key")
+
+
+def includes(expression: str, other: str) -> bool:
+    """Zenoh's wildcards inside a chunk and for a chunk; `**` stands at the end only."""
+    pattern = re.escape(expression).replace(r"\$\*", "[^/]*").replace(r"\*\*", ".*").replace(r"\*", "[^/]+")
+    return re.fullmatch(pattern, other) is not None
+
+
+def allowed(control: dict[str, Any], name: str, flow: str, message: str, key: str) -> bool:
+    """The decision of a router, by the name in a certificate."""
+    subjects = [each["id"] for each in control["subjects"] if name in each.get("cert_common_names", ())]
+    rules = [
+        rule for each in control["policies"] if set(each["subjects"]) & set(subjects) for rule in each["rules"]
+    ]
+    return any(
+        flow in rule["flows"] and message in rule["messages"] and any(includes(k, key) for k in rule["key_exprs"])
+        for rule in control["rules"]
+        if rule["id"] in rules
+    )
+
+
+def test_processes_do_nothing_that_the_router_would_deny(monkeypatch: pytest.MonkeyPatch) -> None:
+    targets = (msgspec.structs.replace(SMALL.targets[0], tracker="sighted"), TargetConfig(name="x"))
+    vehicles = msgspec.structs.replace(SMALL.vehicles, sense_range_m=400.0)
+    standbys = StandbyConfig(planner=1, targets=1)
+    scenario = msgspec.structs.replace(SMALL, targets=targets, vehicles=vehicles, standbys=standbys)
+    done: set[tuple[str, str, str]] = set()
+    for method, message in {
+        "publish": "put", "subscribe": "declare_subscriber", "serve": "declare_queryable", "ask": "query",
+    }.items():  # fmt: skip
+        note(monkeypatch, method, message, done)
+    Simulation(scenario).run_until(6)
+    names = certificate_names(scenario)
+    control = access_control("swarm", names)
+    whose = {node: certificate_name(scenario, *node.split("-", 1)) for node, *_ in done}
+    watching = {node for node in whose if whose[node] not in names}
+    assert {whose[node].partition(".")[0] for node in whose} >= {"keeper", "planner", "agent", "targets"}
+    assert {message for _, message, _ in done} == {"put", "declare_subscriber", "declare_queryable", "query"}
+    denied = {
+        (node, message, key)
+        for node, message, key in done
+        if not allowed(control, "operator.0" if node in watching else whose[node], "ingress", message, key)
+    }
+    assert denied == set()
+
+
+def note(monkeypatch: pytest.MonkeyPatch, method: str, message: str, done: set[tuple[str, str, str]]) -> None:
+    """Adds to `done` what processes call: (node, Zenoh's name of the message, key expression)."""
+    real = getattr(MemoryBus, method)
+
+    def noted(bus: MemoryBus, topic: Topic, *args: Any, **kwargs: Any) -> None:
+        fields: Mapping[str, str | int] = {name: kwargs[name] for name in topic.fields if name in kwargs}
+        done.add((bus.node, message, topic.expression("swarm", **fields)))
+        real(bus, topic, *args, **kwargs)
+
+    monkeypatch.setattr(MemoryBus, method, noted)
+
+
+def test_every_process_of_a_scenario_has_a_name_and_what_the_scenario_admits_beside_them() -> None:
+    scenario = Scenario(
+        groups=(GroupConfig(name="a.b", vehicles=30), GroupConfig(name="red", vehicles=2)),
+        targets=(TargetConfig(name="t", count=2), TargetConfig(name="real", walk="external")),
+        network=NetworkConfig(admit=("keeper.east", "operator.anna", "keeper.0")),
+    )
+    assert certificate_names(scenario) == [
+        "router.0", "keeper.0", "monitor.0", "planner.t0", "planner.t1", "planner.real", "targets.0",
+        "agent.a.b.a0", "agent.a.b.a1", "agent.red.a2", "tracker.real", "operator.0", "keeper.east",
+        "operator.anna",
+    ]  # fmt: skip
+    standing_by = msgspec.structs.replace(scenario, standbys=StandbyConfig(planner=1, targets=2))
+    assert set(certificate_names(standing_by)) - set(certificate_names(scenario)) == {
+        "planner.t0.r1", "planner.t1.r1", "planner.real.r1", "targets.0.r1", "targets.0.r2",
+    }  # fmt: skip
+    agent = bearer("agent.a.b.a1")
+    assert (agent.role, agent.id, agent.author) == ("agent", "a1", "a.b.a1")
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["router", "car1", "agent.a0", "agent..a0", "agent.all.", "keeper.", "pilot.x", "keeper.a/b", "keeper.*", ""],
+)
+def test_a_name_that_no_process_can_have_is_refused(name: str) -> None:
+    with pytest.raises(ConfigError):
+        bearer(name)
+    with pytest.raises(ConfigError):
+        access_control("swarm", [name])
+
+
+def test_who_is_revoked_may_do_nothing_and_its_successor_what_it_might() -> None:
+    key, was = "swarm/stats/agent/a0", "agent.all.a0"
+    for revoked, may in (((), was), ((was,), f"{was}~2"), ((was, f"{was}~2"), f"{was}~3")):
+        assert common_name(was, revoked) == may
+        control = access_control("swarm", ["keeper.0", was], revoked)
+        names = [was, *(f"{was}~{n}" for n in range(1, 5))]
+        assert [name for name in names if allowed(control, name, "ingress", "put", key)] == [may]
+
+
+@pytest.mark.parametrize("names", [(), ("keeper.0",)])
+def test_with_certificates_zenohd_and_our_router_have_the_same_rules_and_without_there_are_none(
+    names: Collection[str],
+) -> None:
+    secured = NetworkConfig(admit=tuple(names), tls=TLS)
+    control = zenohd_config(secured)["access_control"]
+    assert control == access_control("swarm", names)
+    assert control["default_permission"] == "deny"
+    plain = zenohd_config(msgspec.structs.replace(secured, tls=None))
+    assert "access_control" not in plain
+    assert plain["low_pass_filter"] == low_pass_filter(secured.namespace)

@@ -63,13 +63,9 @@ def endings_within(swarm: LocalSwarm, within_s: float = 10.0) -> list[Ending]:
 
 
 def test_processes_end_role_by_role_and_each_has_a_log(swarms: list[LocalSwarm], tmp_path: Path) -> None:
-    rows = [
-        ("router", "0", "quiet"),
-        ("keeper", "0", "quiet"),
-        ("planner", "t0", "quiet"),
-        ("agent", "a0", "quiet"),
-    ]
-    swarm, order = started(swarms, tmp_path, *rows), tmp_path / "order.txt"
+    rows = (("router", "0"), ("keeper", "0"), ("planner", "t0"), ("agent", "a0"))
+    swarm = started(swarms, tmp_path, *((role, id, "quiet") for role, id in rows))
+    order = tmp_path / "order.txt"
     ours = os.getpriority(os.PRIO_PROCESS, 0)
     for running in swarm.running:
         assert running.process.pid is not None

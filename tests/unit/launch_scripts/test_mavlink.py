@@ -284,19 +284,7 @@ def test_when_the_swarm_is_lost_the_vehicle_holds_and_goes_on_when_it_is_back() 
 # --- setpoints ---------------------------------------------------------------------------------------------------
 
 
-def test_px4_gets_ten_setpoints_a_second_and_none_when_the_swarm_is_lost() -> None:
-    vehicle = Autopilot(PX4)
-    world = driving(GUIDED, vehicle, seconds=1.0)
-    setpoints = [each for each in world.run(3.0) if isinstance(each, codec.Setpoint)]
-    assert 29 <= len(setpoints) <= 31
-    assert setpoints[0].height_m is None
-    assert FRAME.cell(*FRAME.from_wgs84(setpoints[0].lat_deg, setpoints[0].lon_deg)) == GRID.cell(40, 39)
-    world.adapter.hear_swarm(False)
-    assert not [each for each in world.run(5.0) if isinstance(each, codec.Setpoint)]
-    assert vehicle.mode == MANUAL
-
-
-def test_px4_is_brought_into_offboard_after_a_second_of_setpoints() -> None:
+def test_px4_gets_setpoints_before_it_is_brought_into_offboard_and_none_when_the_swarm_is_lost() -> None:
     vehicle = Autopilot(PX4)
     world = driving(Wishes("t0", "guided", arm=True), vehicle, seconds=8.0)
     first = next(ns for ns, action in world.said if isinstance(action, codec.Setpoint))
@@ -305,6 +293,12 @@ def test_px4_is_brought_into_offboard_after_a_second_of_setpoints() -> None:
     )
     assert 1.0 <= (mode - first) / 1e9 <= 1.2
     assert (vehicle.mode, vehicle.armed) == (OFFBOARD, True)
+    setpoints = [each for each in world.run(3.0) if isinstance(each, codec.Setpoint)]
+    assert 29 <= len(setpoints) <= 31
+    assert setpoints[0].height_m is None
+    assert FRAME.cell(*FRAME.from_wgs84(setpoints[0].lat_deg, setpoints[0].lon_deg)) == GRID.cell(40, 39)
+    world.adapter.hear_swarm(False)
+    assert not [each for each in world.run(5.0) if isinstance(each, codec.Setpoint)]
 
 
 def test_ardupilot_gets_the_next_turn_each_second_and_its_own_place_when_the_swarm_is_lost() -> None:

@@ -1,11 +1,11 @@
 """Metrics are valid OpenMetrics whatever comes from the network, and give the figures of the processes."""
 
-import http.client
 import json
 import re
-import threading
 from collections.abc import Iterator
+from concurrent.futures import ThreadPoolExecutor, wait
 from pathlib import Path
+from urllib.request import Request, urlopen
 
 import pytest
 from hypothesis import given
@@ -49,26 +49,15 @@ def figures() -> Families:
     return families(Run("r1", "demo", _BEGAN_NS), counts, {"t0": status}, [("agent", "a0")])
 
 
-def _scraped(
-    endpoint: MetricsEndpoint, figures: Families, path: str = "/metrics", **headers: str
-) -> tuple[int, str]:
-    """Status and text of a scrape, answered by this thread as its owner would."""
-    found: list[tuple[int, str]] = []
-
-    def scrape() -> None:
-        host, port = endpoint.url.removeprefix("http://").split("/")[0].split(":")
-        connection = http.client.HTTPConnection(host, int(port), timeout=10)
-        connection.request("GET", path, headers=headers)
-        reply = connection.getresponse()
-        found.append((reply.status, reply.read().decode()))
-        connection.close()
-
-    visitor = threading.Thread(target=scrape)
-    visitor.start()
-    while visitor.is_alive():
-        endpoint.answer(lambda: figures)
-        visitor.join(0.01)
-    return found[0]
+def _scraped(endpoint: MetricsEndpoint, figures: Families, **headers: str) -> str:
+    """The text of a scrape, answered by this thread as its owner would."""
+    with ThreadPoolExecutor(1) as visitor:
+        reply = visitor.submit(urlopen, Request(endpoint.url, headers=headers), timeout=10)
+        while not reply.done():
+            endpoint.answer(lambda: figures)
+            wait([reply], 0.01)
+    with reply.result() as told:
+        return str(told.read().decode())
 
 
 @pytest.fixture
@@ -87,9 +76,7 @@ def _samples(text: str) -> dict[tuple[str, ...], float]:
 
 
 def test_a_scrape_says_what_processes_said(endpoint: MetricsEndpoint, figures: Families) -> None:
-    status, text = _scraped(endpoint, figures, accept="application/openmetrics-text; version=1.0.0")
-    found = _samples(text)
-    assert status == 200
+    found = _samples(_scraped(endpoint, figures, accept="application/openmetrics-text; version=1.0.0"))
     assert found["swarm_run_info", "run_id=r1", "scenario=demo"] == 1
     assert found["swarm_process_up", "id=a0", "role=agent"] == 1
     assert found["swarm_process_up", "id=0", "role=targets"] == 0, "its token is not up"
@@ -109,8 +96,10 @@ def test_a_scrape_says_what_processes_said(endpoint: MetricsEndpoint, figures: F
 
 
 def test_prometheus_of_any_age_reads_it(endpoint: MetricsEndpoint, figures: Families) -> None:
-    _, text = _scraped(endpoint, figures)
-    assert {family.name for family in plain_families(text)} >= {"swarm_captures", "swarm_route_query_seconds"}
+    assert {family.name for family in plain_families(_scraped(endpoint, figures))} >= {
+        "swarm_captures",
+        "swarm_route_query_seconds",
+    }
 
 
 _names = st.one_of(

@@ -33,7 +33,7 @@ from swarm.wire.messages.orders import GoalState, GoalStates
 from swarm.wire.messages.planning import Believed, Sighted
 from swarm.wire.messages.processes import Stats
 from swarm.wire.messages.vehicles import Followed, Obstacle
-from swarm.wire.topics import FOLLOWED, STATS, TOPICS
+from swarm.wire.topics import STATS, TOPICS
 
 SCENARIO, TERRAIN = little_scenario(), little_terrain()
 
@@ -69,7 +69,7 @@ def recorded(tmp_path: Path, scenario: Scenario = SCENARIO) -> tuple[Path, Rig]:
     return tmp_path / "run.rrd", rig
 
 
-def test_a_recording_holds_all_that_is_to_be_seen(tmp_path: Path) -> None:
+def test_a_recording_holds_all_that_is_to_be_seen_and_who_each_instance_is(tmp_path: Path) -> None:
     _, rig = recorded(tmp_path)
     tiles = rig.mesh.tiles
     rows = rows_by_entity(tmp_path / "run.rrd")
@@ -84,9 +84,16 @@ def test_a_recording_holds_all_that_is_to_be_seen(tmp_path: Path) -> None:
     textures = [rows[f"/world/ground/{tile}"] for tile in range(tiles)]
     assert min(textures) >= 1
     assert max(textures) >= 2, "marks change the photo"
-    assert {"albedo_factor", "albedo_texture_buffer"} <= components(
-        tmp_path / "run.rrd", "/world/ground/0"
-    ).keys(), "a picture is as bright as it is painted, bare ground is not"
+    bright = components(tmp_path / "run.rrd", "/world/ground/0").keys()
+    assert {"albedo_factor", "albedo_texture_buffer"} <= bright, "as it is painted, and bare ground is not"
+    # With more than three components of an instance, the viewer shows only their number at the pointer.
+    for entity, sentence in (("/world/vehicles", "vehicle"), ("/world/targets/balls", "target")):
+        parts = components(tmp_path / "run.rrd", entity)
+        parts = {name: rows for name, rows in parts.items() if not name.endswith("RowId")}
+        assert set(parts) == {"positions", "colors", sentence}
+        assert len(parts[sentence][-1]) == len(parts["positions"][-1])
+    said = components(tmp_path / "run.rrd", "/world/vehicles")["vehicle"][-1]
+    assert any(": following, route " in line for line in said)
 
 
 def components(path: Path, entity: str, since_s: float = 0.0) -> dict[str, list[Any]]:
@@ -101,19 +108,6 @@ def components(path: Path, entity: str, since_s: float = 0.0) -> dict[str, list[
             rows = [row for t, row in zip(at_s, batch.column(name).to_pylist(), strict=True) if t >= since_s]
             found.setdefault(name.rpartition(":")[2], []).extend(row for row in rows if row is not None)
     return {name: rows for name, rows in found.items() if rows}
-
-
-def test_an_instance_has_three_components_of_which_one_says_who_it_is(tmp_path: Path) -> None:
-    """With more than three, the viewer shows only their number at the pointer."""
-    recorded(tmp_path)
-    for entity, sentence in (("/world/vehicles", "vehicle"), ("/world/targets/balls", "target")):
-        parts = components(tmp_path / "run.rrd", entity)
-        parts = {name: rows for name, rows in parts.items() if not name.endswith("RowId")}
-        assert set(parts) == {"positions", "colors", sentence}
-        assert len(parts[sentence][-1]) == len(parts["positions"][-1])
-    assert any(
-        ": following, route " in line for line in components(tmp_path / "run.rrd", "/world/vehicles")["vehicle"][-1]
-    )
 
 
 def test_who_opens_the_view_late_has_all_of_it_soon(tmp_path: Path) -> None:
@@ -209,13 +203,8 @@ def test_no_recording_replaces_another(tmp_path: Path) -> None:
 
 def test_a_route_that_leaves_the_map_is_counted_and_not_drawn() -> None:
     rig = Rig(SCENARIO, TERRAIN, None)
-    rig.speaker.publish(
-        FOLLOWED,
-        Followed(vehicle="v", target="t0", start=0, directions=b"\x00", cost_s=1.0, lower_bound_s=1.0),
-        agent="a0",
-        vehicle="v",
-    )
-    rig.run(1)
+    route = Followed(vehicle="v", target="t0", start=0, directions=b"\x00", cost_s=1.0, lower_bound_s=1.0)
+    rig.play([(1, route)])
     assert rig.service.counters.counts["routes_unreadable"] == 1
     rig.close()
 

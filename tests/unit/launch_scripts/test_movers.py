@@ -306,30 +306,26 @@ def test_of_what_is_drawn_only_what_differs_is_news_until_it_is_forgotten() -> N
 GRID = GridSpec(4, 7, 10.0)
 
 
-@given(st.integers(-(1 << 31), (1 << 32) - 1) | st.integers(-3, 30) | st.none())
-@example(-(1 << 31))
-@example(27)
-def test_an_alarm_is_told_wherever_it_says_it_is_and_has_a_place_if_that_is_in_the_grid(cell: int | None) -> None:
+@given(
+    st.integers(-(1 << 31), (1 << 32) - 1) | st.integers(-3, 30) | st.none(),
+    st.text(max_size=20), st.text(max_size=20), st.text(max_size=60),
+)  # fmt: skip
+@example(-(1 << 31), "down", "\x1b]0;x\x07", "a\nb\x9b2J")
+@example(27, "x", "y", "z")
+def test_an_alarm_is_one_line_that_no_terminal_obeys_and_has_a_place_if_that_is_in_the_grid(
+    cell: int | None, kind: str, about: str, text: str
+) -> None:
     latest = LatestState(RunPlan((), (), 0, 0), GRID)
-    told = WireAlarm(kind="x", about="y", text="z", since_ns=3 * NS_PER_S, over_ns=90 * NS_PER_S, cell=cell)
-    latest.heard(stats(alarms=[told]), 2)
-    [alarm] = state_of(latest, 3).alarms
-    row, col = divmod(cell, 7) if cell is not None and cell in range(28) else (None, None)
-    assert alarm.where == ("" if row is None else f"row {row}, col {col}")
-    assert (alarm.fields()["row"], alarm.fields()["col"]) == (row, col)
-    assert alarm.line.endswith(", for 87 s")
-
-
-@given(st.text(max_size=20), st.text(max_size=20), st.text(max_size=60))
-@example("down", "\x1b]0;x\x07", "a\nb\x9b2J")
-def test_an_alarm_is_one_line_that_no_terminal_obeys_whatever_it_says(kind: str, about: str, text: str) -> None:
-    latest = LatestState(RunPlan((), (), 0, 1), GRID)
-    told = WireAlarm(kind=kind, about=about, text=text, since_ns=1, over_ns=2)
+    told = WireAlarm(kind=kind, about=about, text=text, since_ns=3 * NS_PER_S, over_ns=90 * NS_PER_S, cell=cell)
     latest.heard(stats(alarms=[told]), 2)
     [alarm] = state_of(latest, 3).alarms
     assert alarm.line.isprintable()
     if text.isprintable():
         assert alarm.text == text
+    row, col = divmod(cell, 7) if cell is not None and cell in range(28) else (None, None)
+    assert alarm.where == ("" if row is None else f"row {row}, col {col}")
+    assert (alarm.fields()["row"], alarm.fields()["col"]) == (row, col)
+    assert alarm.line.endswith(", for 87 s")
 
 
 def test_no_message_says_since_and_a_number_of_seconds() -> None:

@@ -15,7 +15,7 @@ from support.command import Swarm
 
 from launch_scripts import ports
 from launch_scripts.check import machine_check as machine
-from launch_scripts.check.scenario_check import files_named, not_made, one_way_share, places, shards
+from launch_scripts.check.scenario_check import files_named, one_way_share, places, shards
 from launch_scripts.simulation.world.walks import TrueTerrain
 from shared_map.terrain.terrain import terrain_of_pace
 from shared_map.vehicle_class_grounds import class_grounds
@@ -161,22 +161,13 @@ def test_more_shards_than_agents_have_use_for_are_a_warning_with_what_to_set() -
 
 
 def test_all_keys_that_are_wrong_are_named_each_once_and_missing_files_beside_them() -> None:
-    text = """
+    triangle = "polygon_m = [[1, 1], [2, 2], [3, 3]]"
+    text = f"""
 seed = -1
 secnds = 3
-[terrain]
-source = "none.tif"
-rodes = 4
-[[cost.zones]]
-kind = "forbiden"
-polygon_m = [[1, 1], [2, 2], [3, 3]]
-[[cost.zones]]
-polygon_m = [[1, 1], [2, 2], [3, 3]]
-[[groups]]
-vehicles = 0
-[[groups]]
-vehicles = 1.5
-start = "heap"
+terrain = {{ source = "none.tif", rodes = 4 }}
+cost.zones = [{{ kind = "forbiden", {triangle} }}, {{ {triangle} }}]
+groups = [{{ vehicles = 0 }}, {{ vehicles = 1.5, start = "heap" }}]
 """
     scenario, faults, _ = read_scenario(text, "s.toml")
     assert scenario is not None
@@ -332,19 +323,6 @@ def test_the_memory_of_routes_to_places_is_the_budget_of_trees_and_a_tree_in_han
     )
     least = PLACE_TREES_BYTES + 2 * 20 * 2048**2
     assert least < with_places.memory_bytes - lone.memory_bytes < least + (128 << 20)
-
-
-@pytest.mark.parametrize(
-    "key", ["vehicles.sensor", "vehicles.assignment", "vehicles.dynamics", "planner.strategy", "targets[0].walk"]
-)
-def test_a_check_refuses_a_function_of_another_library_as_the_run_does(key: str) -> None:
-    section, _, name = key.rpartition(".")
-    text = {"targets[0]": f'[[targets]]\n{name} = "os:system"'}.get(section, f'[{section}]\n{name} = "os:system"')
-    scenario = parse_scenario(text if "targets" in text else f"[[targets]]\n{text}")
-    (refused,) = not_made(scenario, GridSpec(4, 5, 10.0), np.full((4, 5), 0.1, np.float32))
-    assert (refused.level, refused.about) == ("failure", key)
-    assert "'os:system' could not be made: TypeError" in refused.text
-    assert list(not_made(parse_scenario("[[targets]]"), GridSpec(4, 5, 10.0), np.ones((4, 5), np.float32))) == []
 
 
 def test_a_choice_is_said_with_all_that_it_allows() -> None:

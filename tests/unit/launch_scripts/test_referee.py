@@ -191,32 +191,39 @@ def on(from_ms: int, until_ms: int, col: int) -> list[tuple[int, Fleet]]:
     return [vehicle(at, col) for at in range(from_ms, until_ms, 100)]
 
 
-def test_a_vehicle_that_enters_a_cell_which_an_obstacle_has_closed_for_two_ticks_is_at_fault() -> None:
-    (hit,) = judged_hits(*standing(0, 2000, 5.5), *on(50, 1000, 4), *on(1050, 2000, 5))
-    assert hit.count == "driven_into"
-    assert hit.sentence(0).startswith("a drove into obstacle r1, known for 1.1 s")
+COMES = [
+    obstacle(at, 2.5 + at / 1000 * 1.5, heading_rad=math.pi / 2, speed_m_per_s=15.0) for at in range(0, 2000, 100)
+]
+"""It closes the cell ahead of itself before it is there."""
+HITS: dict[str, tuple[list[tuple[int, Any]], str, str]] = {
+    "a vehicle enters a cell that an obstacle has closed for two ticks": (
+        [*standing(0, 2000, 5.5), *on(50, 1000, 4), *on(1050, 2000, 5)],
+        "driven_into", "a drove into obstacle r1, known for 1.1 s",
+    ),
+    "a vehicle crosses the way on which an obstacle comes": (
+        [*COMES, *on(50, 1600, 9), *on(1650, 2000, 5)], "driven_into", "a drove into obstacle r1",
+    ),
+    "an obstacle drives into a vehicle": (
+        [*on(50, 2000, 5), *standing(0, 1000, 3.5), *standing(1000, 2000, 5.5)],
+        "hit_by_obstacles", "obstacle r1 drove into a, which was there first",
+    ),
+    "a vehicle enters where an obstacle has just come: it had no time": (
+        [*on(50, 1000, 4), *on(1050, 2000, 5), *standing(900, 2000, 5.5)],
+        "hit_by_obstacles", "obstacle r1 met a 0.15 s after its first report",
+    ),
+    "reports are missing: the vehicle may have come before the obstacle": (
+        [*standing(1000, 3000, 5.5), *on(50, 300, 4), *on(2050, 3000, 5)], "hit_by_obstacles", "obstacle r1",
+    ),
+}  # fmt: skip
+"""Happening -> the reports, who is at fault, and the begin of the sentence."""
 
 
-def test_an_obstacle_that_drives_into_a_vehicle_is_at_fault() -> None:
-    (hit,) = judged_hits(*on(50, 2000, 5), *standing(0, 1000, 3.5), *standing(1000, 2000, 5.5))
-    assert hit.count == "hit_by_obstacles"
-    assert hit.sentence(0).startswith("obstacle r1 drove into a, which was there first")
-
-
-def test_a_vehicle_that_enters_where_an_obstacle_has_just_come_had_no_time() -> None:
-    (hit,) = judged_hits(*on(50, 1000, 4), *on(1050, 2000, 5), *standing(900, 2000, 5.5))
-    assert hit.count == "hit_by_obstacles"
-    assert hit.sentence(0).startswith("obstacle r1 met a 0.15 s after its first report")
-
-
-def test_a_vehicle_that_crosses_the_way_on_which_an_obstacle_comes_is_at_fault() -> None:
-    """The obstacle had closed the cell ahead of itself before it was there."""
-    comes = [
-        obstacle(at, 2.5 + at / 1000 * 1.5, heading_rad=math.pi / 2, speed_m_per_s=15.0)
-        for at in range(0, 2000, 100)
-    ]
-    (hit,) = judged_hits(*comes, *on(50, 1600, 9), *on(1650, 2000, 5))
-    assert hit.count == "driven_into"
+@pytest.mark.parametrize("what", HITS)
+def test_each_hit_is_told_once_and_blamed_on_who_could_have_avoided_it(what: str) -> None:
+    reports, count, says = HITS[what]
+    (hit,) = judged_hits(*reports)
+    assert hit.count == count
+    assert hit.sentence(0).startswith(says)
 
 
 @pytest.mark.parametrize("lease_s", [0.0, 0.3])
@@ -228,10 +235,3 @@ def test_an_overlap_that_late_messages_explain_is_no_hit() -> None:
     assert (
         judged_hits(*standing(0, 1000, 5.5), *standing(1000, 2000, 8.5), *on(50, 800, 4), *on(900, 2000, 5)) == []
     )
-
-
-def test_an_encounter_is_told_once_and_a_vehicle_of_which_reports_are_missing_is_not_blamed() -> None:
-    hits = judged_hits(*standing(0, 3000, 5.5), *on(50, 1000, 4), *on(1050, 3000, 5))
-    assert len(hits) == 1
-    (hit,) = judged_hits(*standing(1000, 3000, 5.5), *on(50, 300, 4), *on(2050, 3000, 5))
-    assert hit.count == "hit_by_obstacles", "it may have come before the obstacle"

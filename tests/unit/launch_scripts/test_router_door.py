@@ -2,9 +2,11 @@
 
 import contextlib
 import socket
+import socketserver
 import ssl
 import threading
 from collections.abc import Iterator
+from typing import Any
 
 import pytest
 from hypothesis import given
@@ -87,37 +89,29 @@ def test_one_site_of_ip_6_has_one_budget() -> None:
     assert neighbourhood("fe80::1%eth0") == neighbourhood("fe80::2")
 
 
-class Inside:
+class Inside(socketserver.ThreadingTCPServer):
     """A listener behind a door, which sends everything back."""
 
-    def __init__(self) -> None:
-        self.listening = socket.create_server(("127.0.0.1", 0))
-        self.accepted = 0
-        threading.Thread(target=self._accept, daemon=True).start()
+    daemon_threads = True
+    accepted = 0
 
-    def _accept(self) -> None:
-        with contextlib.suppress(OSError):
-            while True:
-                connection, _ = self.listening.accept()
-                self.accepted += 1
-                threading.Thread(target=self._echo, args=(connection,), daemon=True).start()
-
-    def _echo(self, connection: socket.socket) -> None:
-        with connection:
-            while piece := connection.recv(1 << 16):
-                connection.sendall(piece)
+    def finish_request(self, request: Any, client_address: Any) -> None:
+        self.accepted += 1
+        while piece := request.recv(1 << 16):
+            request.sendall(piece)
 
 
 @pytest.fixture
 def inside() -> Iterator[Inside]:
-    made = Inside()
-    yield made
-    made.listening.close()
+    with Inside(("127.0.0.1", 0), socketserver.BaseRequestHandler) as made:
+        threading.Thread(target=made.serve_forever, args=(0.02,), daemon=True).start()
+        yield made
+        made.shutdown()
 
 
 @pytest.fixture
 def door(inside: Inside) -> Iterator[Door]:
-    made = Door([("127.0.0.1", 0)], inside.listening.getsockname())
+    made = Door([("127.0.0.1", 0)], inside.socket.getsockname())
     yield made
     made.close()
 
@@ -175,7 +169,7 @@ def test_a_router_that_reopens_is_no_fault_of_its_visitors(door: Door, inside: I
 
 @pytest.mark.skipif(not socket.has_dualstack_ipv6(), reason="no IPv6 here")
 def test_a_door_at_all_addresses_of_ip_6_serves_ip_4_too(inside: Inside) -> None:
-    door = Door([("::", 0)], inside.listening.getsockname())
+    door = Door([("::", 0)], inside.socket.getsockname())
     for host in ("127.0.0.1", "::1"):
         with socket.create_connection((host, door.places[0][1]), 10) as visitor:
             visitor.sendall(HELLO)
