@@ -57,20 +57,14 @@ def save_array(path: Path, array: NDArray[Any]) -> None:
 
 
 def private_copy(array: NDArray[Any]) -> NDArray[Any]:
-    """A copy that may be written to. Of an array from `open_array`, or its first elements, only the pages (4 KiB
-    each) that are written to are copied, at the first write; the file stays as it is."""
+    """A copy that may be written to. Of an array from `open_array` only the pages (4 KiB each) that are written to are
+    copied, at the first write; the file stays as it is."""
     mapped = array.base
     while type(mapped) is np.ndarray:
         mapped = mapped.base
-    if (
-        not isinstance(mapped, _Mapped)
-        or mapped.dtype != array.dtype
-        or mapped.ndim != array.ndim
-        or mapped.ctypes.data != array.ctypes.data
-        or not array.flags.c_contiguous
-    ):
+    if not isinstance(mapped, _Mapped) or mapped.__array_interface__ != array.__array_interface__:
         return np.array(array)
-    return np.asarray(_map(mapped.file, mapped.dtype, array.shape, mapped.offset, "c"))
+    return np.asarray(_map(mapped.file, mapped.dtype, mapped.shape, mapped.offset, "c"))
 
 
 @functools.cache

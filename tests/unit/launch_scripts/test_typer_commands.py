@@ -245,6 +245,13 @@ def test_a_command_whose_streams_are_closed_ends_without_a_traceback() -> None:
     assert done.stderr.count(b"\n") == 1
 
 
+def test_a_command_that_may_use_no_more_memory_says_so_in_a_sentence() -> None:
+    run = "from launch_scripts.typer_commands import run_command; raise SystemExit(run_command(lambda: bytes(1 << 62)))"
+    done = subprocess.run([sys.executable, "-c", run], capture_output=True, text=True)
+    assert (done.returncode, done.stdout) == (1, "")
+    assert done.stderr == "swarm: this takes more memory than a process may use here (ulimit -v)\n"
+
+
 @pytest.mark.parametrize("code", [130, None])
 def test_a_ctrl_c_before_anything_runs_is_answered_with_a_word(
     code: int | None, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

@@ -49,11 +49,10 @@ def test_a_mark_leaves_the_file_and_every_other_process_as_they_were(tmp_path: P
 def test_a_private_copy_takes_memory_only_where_it_is_written_to(tmp_path: Path) -> None:
     save_array(tmp_path / "a.npy", np.ones((2048, 1024), np.float32))
     whole = open_array(tmp_path / "a.npy")
-    for copy in (private_copy(whole), private_copy(whole[:-1])):
-        assert copy.sum() == copy.size  # every page is read
-        copy[7, 7] = 5
-        own_kib = _anonymous_kib(copy)
-        assert 4 <= own_kib <= 64
+    copy = private_copy(whole)
+    assert copy.sum() == copy.size  # every page is read
+    copy[7, 7] = 5
+    assert 4 <= _anonymous_kib(copy) <= 64
 
 
 def _anonymous_kib(array: np.ndarray) -> int:
@@ -82,7 +81,7 @@ def test_an_array_outlives_its_files_name_and_what_takes_it_next(tmp_path: Path)
 def test_what_is_no_whole_mapped_array_is_copied(tmp_path: Path) -> None:
     save_array(tmp_path / "a.npy", np.arange(12.0).reshape(3, 4))
     whole = open_array(tmp_path / "a.npy")
-    for array in (whole[1:], whole.T, np.arange(3.0)):
+    for array in (whole[1:], whole[:-1], whole.T, np.arange(3.0)):
         copy = private_copy(array)
         np.testing.assert_array_equal(copy, array)
         copy[0] = -1
