@@ -16,8 +16,8 @@ from hypothesis import strategies as st
 from support import slow_twins as naive
 from support.effort import few
 from support.fields import make_field, paces_of_any_ratio
-from support.kernel_oracle import inner, loaded
-from support.planner_strategies import RULES, STRATEGIES, random_climb, random_pace
+from support.kernel_oracle import grown, inner, loaded
+from support.planner_strategies import RULES, STRATEGIES, open_cell, random_climb, random_pace
 
 from planner_service.kernels.cell_costs import CHEAPEST_S, DEAREST_S
 from planner_service.kernels.layout import NONE
@@ -76,10 +76,8 @@ def test_trees_over_costs_of_any_ratio_are_right_to_the_last_bit(field: str) -> 
     pace = make_field(field, 64)
     for number, (_, paces) in enumerate(paces_of_any_ratio(pace, np.random.default_rng(1))):
         rules = RULES[number % len(RULES)]
-        ground = loaded(paces, **rules)
-        tree = CostToGoTree(ground)
-        target = int(np.flatnonzero(np.isfinite(paces))[1500])
-        tree.grow(target)
+        ground, target = loaded(paces, **rules), int(np.flatnonzero(np.isfinite(paces))[1500])
+        tree = grown(ground, target)
         best = naive.cost_to_go_in_float32(inner(tree, ground.cell_cost), target, **rules)
         np.testing.assert_array_equal(inner(tree, tree.cost), best)
         assert tree.reach >= best[np.isfinite(best)].max()
@@ -217,12 +215,9 @@ GROUNDS: dict[str, Paces] = {
 def planned(draw: Paces, seed: int, rows: int, cols: int) -> tuple[CostToGoTree, np.ndarray, int]:
     rng = np.random.default_rng(seed)
     climb = random_climb(rng, GridSpec(rows, cols, 1.0), (0.0, 0.1, 0.4)[seed % 3], (0.3, 10.0)[seed % 2])
-    costs = CostGrid(climb.grid, PlannerConfig(**RULES[seed % 5]), climb)
     pace = draw(rng, rows, cols)
-    costs.load(pace)
-    root = int(rng.choice(np.flatnonzero(np.isfinite(pace))))
-    tree = CostToGoTree(costs)
-    tree.grow(root)
+    costs, root = loaded(pace, climb.grid, climb, **RULES[seed % 5]), open_cell(rng, pace)
+    tree = grown(costs, root)
     best = naive.cost_to_go_in_float32(inner(tree, costs.cell_cost), root, climb=climb, **RULES[seed % 5])
     return tree, best, root
 

@@ -5,7 +5,7 @@ import pytest
 from support import slow_twins as naive
 from support.effort import few
 from support.kernel_oracle import WALLS, loaded
-from support.planner_strategies import RULES, random_climb, random_pace
+from support.planner_strategies import RULES, inside, open_cell, random_climb, random_pace, random_window
 
 from planner_service.goal_tree_cache import GoalTrees
 from planner_service.kernels.queue_dial import NO_AIM
@@ -19,16 +19,12 @@ from swarm.wire.route_columns import RouteBatch, RouteStatus
 ROUNDING = 1e-5
 
 
-def open_cell(rng: np.random.Generator, pace: np.ndarray) -> int:
-    return int(rng.choice(np.flatnonzero(np.isfinite(pace))))
-
-
 def marked(rng: np.random.Generator, pace: np.ndarray, ratio: float) -> Window:
     """A patch of other ground, walls among it, of cells that stay in the range of paces."""
-    row, col = int(rng.integers(pace.shape[0])), int(rng.integers(pace.shape[1]))
-    patch = pace[row : row + int(rng.integers(1, 4)), col : col + int(rng.integers(1, 4))]
+    window = random_window(rng, pace, *rng.integers(1, 4, 2).tolist())
+    patch = inside(pace, window)
     patch[:] = random_pace(rng, *patch.shape, ratio, float(rng.choice([0.0, 0.3, 1.0])))
-    return Window(row, col, row + patch.shape[0], col + patch.shape[1])
+    return window
 
 
 def costs_of(growth: PartialGrowth, pace: np.ndarray) -> np.ndarray:

@@ -69,7 +69,7 @@ def test_no_ratio_of_paces_breaks_or_crawls(ratio: float) -> None:
             # 400 steps, each rounded by 2^-23 at most where costs drown in others.
             assert_equals_dijkstra(pace, target, rules, 1e-5 if ratio < 1e12 else 400 * 2**-23)
             begin = time.thread_time()
-            grown(pace, target, rules)
+            grown(loaded(pace, **rules), target)
             assert time.thread_time() - begin < 0.5  # 14,400 cells: 5 ms where nothing else runs
 
 

@@ -11,13 +11,12 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
 from support import slow_twins as naive
-from support.kernel_oracle import inner, loaded, unpadded
-from support.planner_strategies import RULES, random_pace
+from support.kernel_oracle import grown, inner, loaded, unpadded
+from support.planner_strategies import RULES, open_cell, random_pace
 
 from planner_service.kernels import stride_networks
 from planner_service.kernels.stride_networks import StrideNetwork
 from planner_service.tree import cost_to_go, strides
-from planner_service.tree.cost_to_go import CostToGoTree
 from planner_service.tree.strides import find_strides
 from swarm.grid import STEP_COL, STEP_ROW
 
@@ -127,9 +126,8 @@ def test_every_node_that_its_distance_asks_for_is_reached(seed: int, rules: dict
     """For each cell with a way: the node that holds it, of the stride for its distance from the target."""
     ground = Ground(seed, rules)
     rows, cols = ground.pace.shape
-    root = int(ground.rng.choice(np.flatnonzero(np.isfinite(ground.pace))))
-    tree = CostToGoTree(ground.costs)
-    tree.grow(root)
+    root = open_cell(ground.rng, ground.pace)
+    tree = grown(ground.costs, root)
     half = int(ground.rng.integers(2, 6))
     kept = []
     make = stride_networks.make_scratch
@@ -173,8 +171,7 @@ def test_every_node_that_its_distance_asks_for_is_reached(seed: int, rules: dict
 def test_along_strides_no_route_gets_costlier_whatever_was_marked_since(seed: int, rules: dict) -> None:
     ground = Ground(seed, rules)
     grid, costs = ground.costs.grid, ground.costs
-    tree = CostToGoTree(costs)
-    tree.grow(int(ground.rng.choice(np.flatnonzero(np.isfinite(ground.pace)))))
+    tree = grown(costs, open_cell(ground.rng, ground.pace))
     for turn in range(6):
         if turn % 2:
             row, col = int(ground.rng.integers(grid.rows)), int(ground.rng.integers(grid.cols))
