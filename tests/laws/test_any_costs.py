@@ -255,13 +255,14 @@ def test_costs_are_exact_whatever_the_width_of_the_buckets(ground: str, width: f
     np.testing.assert_array_equal(inner(tree, cost), best)
 
 
-def test_no_costs_make_a_growth_many_times_as_long() -> None:
+@pytest.mark.parametrize("directed", [True, False])
+def test_no_costs_make_a_growth_many_times_as_long(directed: bool) -> None:
     """CPU time of 64 x 64 cells, over that of ordinary ground, in turn: at most 10, measured 0.9 to 5."""
-    climb = random_climb(np.random.default_rng(1), GridSpec(64, 64, 1.0), 0.1, 10.0)
+    climb = random_climb(np.random.default_rng(1), GridSpec(64, 64, 1.0), 0.1, 10.0) if directed else None
 
     def grow(draw: Paces) -> Callable[[], float]:
         rng = np.random.default_rng(1)
-        costs = loaded(draw(rng, 64, 64), climb.grid, climb)
+        costs = loaded(draw(rng, 64, 64), climb=climb)
         labels = np.empty(costs.size, np.float32), np.full(costs.size, NONE, np.uint8)
         root = int(rng.choice(np.flatnonzero(np.isfinite(costs.cell_cost))))
 

@@ -337,11 +337,12 @@ class TrafficWorld:
     def run(self, seconds: float) -> None:
         self._scheduler.run_until(self.now_ns + int(seconds * NS_PER_S))
 
-    def assert_all_move(self, seconds: float) -> None:
+    def unmoved_in(self, seconds: float) -> list[str]:
+        """Vehicles that do not move in this time, in which no two meet."""
         before = dict(self.moves)
         self.run(seconds)
         assert self.collisions == []
-        assert [id for id in self.everybody() if self.moves.get(id, 0) == before.get(id, 0)] == []
+        return [id for id in self.everybody() if self.moves.get(id, 0) == before.get(id, 0)]
 
     def everybody(self) -> list[str]:
         return [id for vehicles in self.spawns.values() for id in vehicles]
@@ -449,6 +450,12 @@ class TrafficWorld:
         self.processes.remove(process)
         self.crashes += 1
         self.at(int(self.chance.random() * 2 * NS_PER_S), lambda: self.restart(process))
+
+    def end_all(self, agent: str) -> None:
+        """Ends the processes under a name."""
+        for process in [each for each in self.processes if each.agent == agent]:
+            process.alive = False
+            self.processes.remove(process)
 
     def restart(self, process: Process) -> None:
         if not any(other.disk is process.disk for other in self.processes):
