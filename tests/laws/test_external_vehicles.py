@@ -36,10 +36,7 @@ SHAPES = (
 def world_of(seed: int, twins: bool = True) -> ExternalWorld:
     chance = random.Random(f"guests/{seed}")
     shape, faults = chance.choice(SHAPES), random_faults(chance, QUIET_S)
-    agents, each, size, side, robots, added = shape
-    return ExternalWorld(
-        seed, agents, each, size, side, faults if twins else replace(faults, twins=0), robots, added
-    )
+    return ExternalWorld(seed, *shape[:4], faults if twins else replace(faults, twins=0), *shape[4:])
 
 
 def borders_of(seed: int) -> ExternalWorld:

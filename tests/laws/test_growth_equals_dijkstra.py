@@ -6,8 +6,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from support import slow_twins as naive
-from support.kernel_oracle import RATIOS, loaded, random_grids
+from support.kernel_oracle import loaded, random_grids
 from support.planner_strategies import RULES, random_pace
 from support.processes import words_of_python
 
@@ -21,16 +20,6 @@ from swarm.grid import GridSpec
 @pytest.mark.parametrize("grids", [2_000, pytest.param(10_000, marks=pytest.mark.thorough)])
 def test_random_grids_equal_dijkstra(grids: int) -> None:
     random_grids(grids, 2, 40)
-
-
-def test_scipy_equals_twelve_lines_that_can_be_read() -> None:
-    rng = np.random.default_rng(3)
-    for n in range(20):
-        pace = random_pace(rng, 9, 8, RATIOS[n % 7], 0.25)
-        rules = RULES[n % 5]
-        target = int(np.flatnonzero(np.isfinite(pace))[0])
-        by_hand = naive.cost_to_go_by_hand(pace, target, **rules)
-        np.testing.assert_allclose(naive.cost_to_go(pace, target, **rules), by_hand)
 
 
 @pytest.mark.parametrize("rules", RULES)

@@ -263,6 +263,11 @@ def test_a_payload_of_nested_lists_costs_little_to_refuse():
     assert time.process_time() - began_s < 1
 
 
+def test_a_route_leaves_the_eight_directions_never():
+    with pytest.raises(ValueError, match="directions has 8"):
+        Route(status=RouteStatus.OK, start=0, directions=bytes([8]))
+
+
 def test_a_route_reply_is_readable_as_json():
     reply = json.loads(encode_json(BY_TYPE[RouteReply]))
     found, none = reply["routes"]

@@ -42,10 +42,8 @@ taken."""
 
 def world_of(seed: int) -> TrafficWorld:
     chance = random.Random(f"world/{seed}")
-    agents, each, size, side = chance.choice(SHAPES)
-    return TrafficWorld(
-        seed, agents, each, size, side, random_faults(chance, QUIET_S), walls=chance.choice((0, 0.5))
-    )
+    shape, faults = chance.choice(SHAPES), random_faults(chance, QUIET_S)
+    return TrafficWorld(seed, *shape, faults, walls=chance.choice((0, 0.5)))
 
 
 def duel_of(seed: int) -> TrafficWorld:

@@ -1,12 +1,10 @@
 """Files of stores that a disk or a program has changed: each is read as it was written, or refused in a sentence.
 
-By hand, with more files: `PYTHONPATH=.:tests python tests/laws/test_rotten_files.py 2000`"""
+With more files: `pytest tests/laws/test_rotten_files.py --thorough`."""
 
 import os
 import re
 import shutil
-import sys
-import tempfile
 import time
 from collections import Counter
 from collections.abc import Callable
@@ -339,9 +337,3 @@ def test_no_change_of_a_prepared_terrain_goes_unnoticed(tmp_path: Path) -> None:
         found[f"{what}: {outcome(partial(read_prepared, tried), truth, sentence)}"] += 1
     assert not [each for each in found if not each.endswith((": refused", ": as it was"))], found
     assert {"flip: refused", "zeros: refused", "cut: refused"} <= found.keys()
-
-
-if __name__ == "__main__":
-    for label, each in KINDS.items():
-        with tempfile.TemporaryDirectory() as place:
-            sys.stdout.write(f"{label}: {dict(sorted(tally(each, Path(place), int(sys.argv[1])).items()))}\n")

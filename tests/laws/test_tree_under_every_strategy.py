@@ -181,6 +181,14 @@ def test_whatever_happens_answers_keep_the_laws_and_a_worker_catches_up(
             assert play.tree.target_cell == play.target
 
 
+def test_every_second_of_the_cells_of_an_array_has_its_route() -> None:
+    play = Play(np.ones((20, 20), np.float32), PlannerConfig())
+    every = np.arange(play.grid.cells)
+    some, whole = play.tree.routes(every[::2]), play.tree.routes(every)
+    np.testing.assert_array_equal(some.cost_s, whole.cost_s[::2])
+    np.testing.assert_array_equal(play.tree.cost_to_go_at(every[::2]), play.tree.cost_to_go_at(every)[::2])
+
+
 @LARGE
 def test_the_bound_beyond_the_frontier_counts_time_only_where_length_has_a_price() -> None:
     play = Play(np.ones((40, 40), np.float32), PlannerConfig(length_weight=4.0), has_worker=True)
