@@ -7,7 +7,7 @@ import math
 import statistics
 import time
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -36,15 +36,6 @@ PACES = st.one_of(
 )
 METRES = st.sampled_from([1e-30, 1e-3, 1.0, 30.0, 1e6, 1e12])
 WEIGHTS = st.sampled_from([0.0, 0.0, 1e-30, 0.5, 1e12])
-
-
-@pytest.fixture(scope="module", autouse=True)
-def quiet() -> Iterator[None]:
-    """Maps at the bounds are drawn here; the log about each is not checked."""
-    log = logging.getLogger("planner_service.tree.cost_grid")
-    log.setLevel(logging.ERROR)
-    yield
-    log.setLevel(logging.NOTSET)
 
 
 def test_costs_at_the_bounds_are_said(caplog: pytest.LogCaptureFixture) -> None:
