@@ -99,7 +99,7 @@ class Twin:
         return {each.sender: each for each in self.heard}
 
     def hear(self, report: Obstacle) -> None:
-        """What is no newer than a report that lasts says nothing."""
+        """Takes in a report, unless a lasting one of its sender is as new."""
         new = Heard(report)
         before = self.newest.get(new.sender)
         if before is None or not before.lasts or report.seq > before.report.seq:

@@ -124,7 +124,7 @@ class Running:
             self.store.check()
 
     def killed(self, read: Callable[[], T]) -> T:
-        """What is read once it has been killed."""
+        """Kills it. Returns the result of a reading after that."""
         self.kind.leave(self.store)
         found = read()
         if self.kind is MARKS_IN_USE:
@@ -184,7 +184,7 @@ def rotten(chance: Random, content: bytes, what: str) -> bytes:
 
 
 def outcome(read: Callable[[], object], truth: object, sentence: str) -> str:
-    """What comes of reading files that may be damaged.
+    """Outcome of reading files that may be damaged.
 
     sentence  a pattern of the refusal, which names the file
     """
