@@ -42,7 +42,7 @@ class History:
         self.replica, self.maps = self.anew()
         self.seqs: dict[tuple[int, str], int] = {}
         self.again = seed % 4 == 1
-        """Whether agents that have spoken of kinds of ground start again and speak anew."""
+        """True if agents that have spoken of kinds of ground start again, and speak again."""
         self.words: list[dict[int, Measurement]] = []
 
     def anew(self) -> tuple[MapReplica, ClassMaps]:

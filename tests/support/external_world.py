@@ -18,7 +18,7 @@ _ANOTHER_CELL_NS = 2 * NS_PER_S
 
 
 class Guest(Process):
-    """A process without the core of an agent: nobody asks it what it knows."""
+    """A process without the core of an agent: no one asks it what it knows."""
 
     world: ExternalWorld
 

@@ -40,7 +40,7 @@ def open_cell(rng: np.random.Generator, pace: NDArray[np.float32]) -> int:
 
 
 def cell_near(rng: np.random.Generator, grid: GridSpec, cell: int, far: int) -> int:
-    """A cell of the grid, at most so many rows and columns away."""
+    """A random cell of the grid, at most `far` rows and columns away."""
     row, col = grid.row_col(cell) + rng.integers(-far, far + 1, 2)
     return grid.cell(int(np.clip(row, 0, grid.rows - 1)), int(np.clip(col, 0, grid.cols - 1)))
 
