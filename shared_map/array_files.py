@@ -57,8 +57,8 @@ def save_array(path: Path, array: NDArray[Any]) -> None:
 
 
 def private_copy(array: NDArray[Any]) -> NDArray[Any]:
-    """A copy that may be written to. Of an array from `open_array` only the pages (4 KiB each) that are written to are
-    copied, at the first write; the file stays as it is."""
+    """A copy that may be written to. Of an array from `open_array` only the pages (4 KiB each) that are written to
+    are copied, at the first write; the file stays as it is."""
     mapped = array.base
     while type(mapped) is np.ndarray:
         mapped = mapped.base

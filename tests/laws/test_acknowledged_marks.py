@@ -1,10 +1,9 @@
 """A mark that a keeper acknowledged, and that was not taken back, reaches all replicas in the end. This holds
 through cuts, false deaths, kills, restarts, rebuilt stores and compaction.
 
-By hand, with more examples: `PYTHONPATH=.:tests python tests/laws/test_acknowledged_marks.py 2000`"""
+With more examples: `pytest tests/laws/test_acknowledged_marks.py --thorough --random`."""
 
-import sys
-from collections.abc import Callable
+from collections.abc import Collection
 from typing import Any
 
 import numpy as np
@@ -52,7 +51,7 @@ class History:
     def __init__(self) -> None:
         self.links = LossyLinks(1, jitter_ms=20)
         self.swarm = SwarmModel(self.links, scenario=Scenario(map=MapConfig(compact_after_s=5)))
-        self.cut: set[str] = set()
+        self.cut_off: set[str] = set()
         self.lives = dict.fromkeys((*PROCESSES, *KEEPERS), 0)
         self.authors: dict[str, SyncService] = {}
         self.keepers: dict[str, KeeperService] = {}
@@ -67,13 +66,12 @@ class History:
 
     def take(self, step: Step) -> None:
         what, *arguments = step
-        do: Callable[..., None] = getattr(self, what)
-        if what == "cut":
-            self.cut = set(arguments[0])
-        else:
-            do(*arguments)
-        self.links.far_side = {node for node in self.swarm.buses if node.split(".")[0] in self.cut}
+        getattr(self, what)(*arguments)
+        self.links.far_side = {node for node in self.swarm.buses if node.split(".")[0] in self.cut_off}
         self.look()
+
+    def cut(self, nodes: Collection[str]) -> None:
+        self.cut_off = {*nodes}
 
     def write(self, process: str, cells: list[int], kind: MarkKind) -> None:
         if (author := self.authors.get(process)) is not None:
@@ -90,7 +88,7 @@ class History:
 
     def rebuild(self, name: str) -> None:
         """A keeper's store is damaged, and it begins an empty one: the other has had time for the same marks."""
-        if not self.cut and self.keepers.keys() == set(KEEPERS):
+        if not self.cut_off and self.keepers.keys() == set(KEEPERS):
             self.swarm.run(3)
             self.kill(name)
             self.stores[name] = KeeperStore(":memory:")
@@ -142,25 +140,6 @@ class History:
         self.swarm.run(25)
 
 
-def check(taken: list[Step]) -> None:
-    history = History()
-    for step in taken:
-        history.take(step)
-    history.quiet()
-    kept = history.kept()
-    for at, number in history.acknowledged.items():
-        assert kept[at] >= number, f"of {at} the store has {kept[at]}, but {number} was acknowledged"
-    for author in history.authors.values():
-        name = author.replica.author
-        assert name is not None
-        for tile in range(GRID.tiles):
-            if (own := author.replica.held.get(tile, name)) is not None:
-                assert kept[name, tile] == (own.epoch, own.seq)
-    winners = naive_winners([history.stated[at][number] for at, number in kept.items()])
-    for service in (history.listener, *history.keepers.values(), *history.authors.values()):
-        assert held_winners(service.replica) == winners
-
-
 OVERRULED_BY_A_LIVING_AUTHOR: list[Step] = [
     ("write", "a1", [0], MarkKind.LETHAL), ("run", 1.0),
     ("write", "b1", [0, 40], MarkKind.CLEAR), ("run", 1.0),
@@ -183,11 +162,19 @@ TAKES_BACK_UNHEARD_BY_KEEPERS: list[Step] = [
 @settings(max_examples=few(30), suppress_health_check=list(HealthCheck))
 @given(st.lists(steps(), min_size=4, max_size=30))
 def test_what_was_acknowledged_and_not_taken_back_is_on_all_replicas_in_the_end(taken: list[Step]) -> None:
-    check(taken)
-
-
-if __name__ == "__main__":
-    settings(max_examples=int(sys.argv[1]), suppress_health_check=list(HealthCheck), deadline=None)(
-        given(st.lists(steps(), min_size=4, max_size=40))(check)
-    )()
-    sys.stdout.write("no acknowledged mark was lost\n")
+    history = History()
+    for step in taken:
+        history.take(step)
+    history.quiet()
+    kept = history.kept()
+    for at, number in history.acknowledged.items():
+        assert kept[at] >= number, f"of {at} the store has {kept[at]}, but {number} was acknowledged"
+    for author in history.authors.values():
+        name = author.replica.author
+        assert name is not None
+        for tile in range(GRID.tiles):
+            if (own := author.replica.held.get(tile, name)) is not None:
+                assert kept[name, tile] == (own.epoch, own.seq)
+    winners = naive_winners([history.stated[at][number] for at, number in kept.items()])
+    for service in (history.listener, *history.keepers.values(), *history.authors.values()):
+        assert held_winners(service.replica) == winners

@@ -7,7 +7,7 @@ import math
 import statistics
 import time
 import warnings
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 
 import numpy as np
 import pytest
@@ -16,8 +16,8 @@ from hypothesis import strategies as st
 from support import slow_twins as naive
 from support.effort import few
 from support.fields import make_field, paces_of_any_ratio
-from support.kernel_oracle import inner, loaded
-from support.planner_strategies import RULES, STRATEGIES, random_climb, random_pace
+from support.kernel_oracle import grown, inner, loaded
+from support.planner_strategies import RULES, STRATEGIES, open_cell, random_climb, random_pace
 
 from planner_service.kernels.cell_costs import CHEAPEST_S, DEAREST_S
 from planner_service.kernels.layout import NONE
@@ -36,15 +36,6 @@ PACES = st.one_of(
 )
 METRES = st.sampled_from([1e-30, 1e-3, 1.0, 30.0, 1e6, 1e12])
 WEIGHTS = st.sampled_from([0.0, 0.0, 1e-30, 0.5, 1e12])
-
-
-@pytest.fixture(scope="module", autouse=True)
-def quiet() -> Iterator[None]:
-    """Maps at the bounds are drawn here; the log about each is not checked."""
-    log = logging.getLogger("planner_service.tree.cost_grid")
-    log.setLevel(logging.ERROR)
-    yield
-    log.setLevel(logging.NOTSET)
 
 
 def test_costs_at_the_bounds_are_said(caplog: pytest.LogCaptureFixture) -> None:
@@ -76,10 +67,8 @@ def test_trees_over_costs_of_any_ratio_are_right_to_the_last_bit(field: str) -> 
     pace = make_field(field, 64)
     for number, (_, paces) in enumerate(paces_of_any_ratio(pace, np.random.default_rng(1))):
         rules = RULES[number % len(RULES)]
-        ground = loaded(paces, **rules)
-        tree = CostToGoTree(ground)
-        target = int(np.flatnonzero(np.isfinite(paces))[1500])
-        tree.grow(target)
+        ground, target = loaded(paces, **rules), int(np.flatnonzero(np.isfinite(paces))[1500])
+        tree = grown(ground, target)
         best = naive.cost_to_go_in_float32(inner(tree, ground.cell_cost), target, **rules)
         np.testing.assert_array_equal(inner(tree, tree.cost), best)
         assert tree.reach >= best[np.isfinite(best)].max()
@@ -217,12 +206,9 @@ GROUNDS: dict[str, Paces] = {
 def planned(draw: Paces, seed: int, rows: int, cols: int) -> tuple[CostToGoTree, np.ndarray, int]:
     rng = np.random.default_rng(seed)
     climb = random_climb(rng, GridSpec(rows, cols, 1.0), (0.0, 0.1, 0.4)[seed % 3], (0.3, 10.0)[seed % 2])
-    costs = CostGrid(climb.grid, PlannerConfig(**RULES[seed % 5]), climb)
     pace = draw(rng, rows, cols)
-    costs.load(pace)
-    root = int(rng.choice(np.flatnonzero(np.isfinite(pace))))
-    tree = CostToGoTree(costs)
-    tree.grow(root)
+    costs, root = loaded(pace, climb.grid, climb, **RULES[seed % 5]), open_cell(rng, pace)
+    tree = grown(costs, root)
     best = naive.cost_to_go_in_float32(inner(tree, costs.cell_cost), root, climb=climb, **RULES[seed % 5])
     return tree, best, root
 
@@ -260,13 +246,14 @@ def test_costs_are_exact_whatever_the_width_of_the_buckets(ground: str, width: f
     np.testing.assert_array_equal(inner(tree, cost), best)
 
 
-def test_no_costs_make_a_growth_many_times_as_long() -> None:
+@pytest.mark.parametrize("directed", [True, False])
+def test_no_costs_make_a_growth_many_times_as_long(directed: bool) -> None:
     """CPU time of 64 x 64 cells, over that of ordinary ground, in turn: at most 10, measured 0.9 to 5."""
-    climb = random_climb(np.random.default_rng(1), GridSpec(64, 64, 1.0), 0.1, 10.0)
+    climb = random_climb(np.random.default_rng(1), GridSpec(64, 64, 1.0), 0.1, 10.0) if directed else None
 
     def grow(draw: Paces) -> Callable[[], float]:
         rng = np.random.default_rng(1)
-        costs = loaded(draw(rng, 64, 64), climb.grid, climb)
+        costs = loaded(draw(rng, 64, 64), climb=climb)
         labels = np.empty(costs.size, np.float32), np.full(costs.size, NONE, np.uint8)
         root = int(rng.choice(np.flatnonzero(np.isfinite(costs.cell_cost))))
 

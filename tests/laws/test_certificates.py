@@ -3,13 +3,13 @@ claim."""
 
 import math
 import time
-from typing import Any
 
 import numpy as np
 import pytest
 from numpy.typing import NDArray
+from support.broken_rules import Broken, in_place_of
 from support.effort import few
-from support.kernel_oracle import inner, loaded
+from support.kernel_oracle import grown, inner, loaded
 from support.planner_strategies import random_pace
 from support.slow_twins import lower_bound
 from support.tree_lives import Findings, Life, lives
@@ -17,7 +17,7 @@ from support.tree_lives import Findings, Life, lives
 from planner_service.kernels.layout import NONE
 from planner_service.kernels.tile_pieces import MOST_SLACK
 from planner_service.target_tree import TargetTree
-from planner_service.tree.cost_grid import CostGrid, Walks
+from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
 from planner_service.tree.partitioned_tree import PartitionedTree
 from planner_service.tree.route_bounds import LowerBounds, read_routes
@@ -48,36 +48,41 @@ def test_no_life_of_many_breaks_a_law() -> None:
     assert not any(found.violations.values())
 
 
-def test_a_stated_cost_that_is_not_driven_is_counted(monkeypatch: pytest.MonkeyPatch) -> None:
-    true = CostGrid.walk
-
-    def dearer(*asked: Any) -> Walks:
-        walks = true(*asked)
-        return walks._replace(driven=walks.driven * (1 + 1e-5) + 1e-5)
-
-    monkeypatch.setattr(CostGrid, "walk", dearer)
-    found = checked(range(2)).violations
-    assert found["stated"] > 0
-    assert found["cut"] > 0
+@in_place_of(CostGrid, "walk")
+def states_more_than_is_driven(walk, *asked):
+    walks = walk(*asked)
+    return walks._replace(driven=walks.driven * (1 + 1e-5) + 1e-5)
 
 
-def test_a_bound_that_is_too_high_is_counted_and_its_life_named(monkeypatch: pytest.MonkeyPatch) -> None:
-    true = LowerBounds.at
-    monkeypatch.setattr(LowerBounds, "at", lambda *asked: true(*asked) * 1.01)
+@in_place_of(LowerBounds, "at")
+def proves_too_much(at, *asked):
+    return at(*asked) * 1.01
+
+
+@in_place_of(CostToGoTree, "time_at")
+def answers_by_who_else_asks(time_at, tree, cells):
+    return np.nextafter(time_at(tree, cells), np.inf if cells.size > 1 else 0.0)
+
+
+@pytest.mark.parametrize(
+    ("broken", "laws"),
+    [
+        (states_more_than_is_driven, {"stated", "cut"}),
+        (proves_too_much, {"bound"}),
+        (answers_by_who_else_asks, {"batch"}),
+    ],
+    ids=lambda each: getattr(each, "__name__", ""),
+)
+def test_a_false_claim_is_counted_and_its_life_named(
+    broken: Broken, laws: set[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    broken(monkeypatch)
     findings = checked(range(3, 5))
-    assert findings.violations["bound"] > 0
-    assert 0.009 < findings.worst["bound"] <= 0.01
-    assert findings.example["bound"] in (3, 4)
-
-
-def test_a_route_whose_numbers_depend_on_who_else_asks_is_counted(monkeypatch: pytest.MonkeyPatch) -> None:
-    true = CostToGoTree.time_at
-
-    def told(tree: CostToGoTree, cells: NDArray[np.int64]) -> NDArray[np.float64]:
-        return np.nextafter(true(tree, cells), np.inf if cells.size > 1 else 0.0)
-
-    monkeypatch.setattr(CostToGoTree, "time_at", told)
-    assert checked(range(2)).violations["batch"] > 0
+    for law in laws:
+        assert findings.violations[law] > 0
+        assert findings.example[law] in (3, 4)
+    if broken is proves_too_much:
+        assert 0.009 < findings.worst["bound"] <= 0.01
 
 
 def slow_rest(tree: CostToGoTree, cell: int) -> float:
@@ -95,10 +100,7 @@ def slow_rest(tree: CostToGoTree, cell: int) -> float:
 def a_tree(seed: int, length_weight: float = 0.0) -> tuple[CostToGoTree, NDArray[np.float32]]:
     pace = random_pace(np.random.default_rng(seed), GRID.rows, GRID.cols, 30.0, 0.25)
     pace[20, 30] = 1.0
-    costs = loaded(pace, GRID, length_weight=length_weight)
-    tree = CostToGoTree(costs)
-    tree.grow(GRID.cell(20, 30))
-    return tree, pace
+    return grown(loaded(pace, GRID, length_weight=length_weight), GRID.cell(20, 30)), pace
 
 
 @pytest.mark.parametrize("seed", range(3))

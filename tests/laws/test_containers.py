@@ -115,11 +115,7 @@ def restricted(pod: dict[str, Any]) -> list[str]:
     return wrong
 
 
-COMPOSE_SCHEMA = json.loads(
-    (Path(check_jsonschema.__file__).parent / "builtin_schemas/vendor/compose-spec.json").read_text(
-        encoding="utf-8"
-    )
-)
+COMPOSE_SCHEMA = Path(check_jsonschema.__file__).parent / "builtin_schemas/vendor/compose-spec.json"
 
 
 @settings(max_examples=few(20), deadline=None, phases=(Phase.explicit, Phase.generate))
@@ -130,7 +126,7 @@ def test_each_process_of_a_machine_is_one_service_that_may_do_nothing_but_its_wo
 
 
 def _check_services(plan: Plan) -> None:
-    validator = jsonschema.Draft7Validator(COMPOSE_SCHEMA)
+    validator = jsonschema.Draft7Validator(json.loads(COMPOSE_SCHEMA.read_text(encoding="utf-8")))
     for host in plan.hosts:
         files = compose_files(plan, host)
         compose = yaml.safe_load(files[COMPOSE_FILE])
@@ -159,17 +155,11 @@ def _check_services(plan: Plan) -> None:
             assert ("/var/lib/swarm" in written) == TABLE[each.process.role].lasting
             assert all(volume.get("read_only") for volume in service["volumes"] if volume["type"] == "bind")
             assert set(service.get("depends_on", {})) <= set(compose["services"])
-        used = {
-            name for service in compose["services"].values() for name in (s["source"] for s in service["secrets"])
-        }
-        assert set(compose["secrets"]) == used
-        assert "ca.key" not in used
+        services = compose["services"].values()
+        assert set(compose["secrets"]) == {each["source"] for service in services for each in service["secrets"]}
+        assert "ca.key" not in compose["secrets"]
         network = parse_scenario(files["scenario.toml"]).network
-        aliases = {
-            alias
-            for service in compose["services"].values()
-            for alias in service["networks"]["swarm"].get("aliases", ())
-        }
+        aliases = {alias for each in services for alias in each["networks"]["swarm"].get("aliases", ())}
         own_router = {f"tls/{alias}:{plan.port}" for alias in aliases}
         elsewhere = {f"tls/{other.address}:{plan.port}" for other in plan.hosts if other is not host}
         assert set(network.connect) <= own_router | elsewhere
@@ -195,7 +185,5 @@ def test_pages_and_examples_name_images_of_this_version() -> None:
     project = tomllib.loads((root / "pyproject.toml").read_text(encoding="utf-8"))
     version = project["tool"]["hatch"]["metadata"]["hooks"]["custom"]["version"]
     pages = [*root.glob("docs/**/*.md"), *root.glob("docs/examples/**/*.yaml")]
-    named = {
-        tag for page in pages for tag in re.findall(r"terrain-swarm:([\d.]+\d)", page.read_text(encoding="utf-8"))
-    }
+    named = {tag for page in pages for tag in re.findall(r"terrain-swarm:([\d.]+\d)", page.read_text("utf-8"))}
     assert named == {version}

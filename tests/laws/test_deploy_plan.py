@@ -150,30 +150,17 @@ def test_like_machines_are_equally_loaded_but_for_a_process_of_each_job(
 
 @settings(max_examples=few(150), deadline=None)
 @given(PLANS)
-def test_planners_of_an_added_target_start_on_one_machine_each(plan: Plan) -> None:
-    ranks = []
-    for host in plan.hosts:
-        words = [process.selector for process in host.processes]
-        if not words:
-            continue
-        table = chosen_processes(plan.scenario, words, None)
+def test_planners_of_an_added_target_start_on_one_machine_each_and_one_with_the_ground_records(plan: Plan) -> None:
+    ranks, records = [], []
+    for host in filter(lambda host: host.processes, plan.hosts):
+        table = chosen_processes(plan.scenario, [process.selector for process in host.processes], None)
         assert [spec.name for spec in table] == [process.name for process in host.processes]
-        own = UpOptions(plan.scenario, Path(), table).ranks_of_added
-        ranks += own
-        assert len(own) <= 1 or len(plan.hosts) == 1
+        launcher = UpOptions(plan.scenario, Path(), table)
+        ranks += launcher.ranks_of_added
+        assert len(launcher.ranks_of_added) <= 1 or len(plan.hosts) == 1
+        records += [host] if launcher.records else []
     assert sorted(ranks) == list(range(plan.scenario.standbys.planner + 1))
-
-
-@settings(max_examples=few(150), deadline=None)
-@given(PLANS)
-def test_one_launcher_records_the_run_on_a_machine_that_has_the_ground(plan: Plan) -> None:
-    records = []
-    for host in plan.hosts:
-        words = [process.selector for process in host.processes]
-        if words and UpOptions(plan.scenario, Path(), chosen_processes(plan.scenario, words, None)).records:
-            records.append(host)
-    assert [host.name for host in records] == [plan.records]
-    assert records[0].has_files
+    assert [(host.name, host.has_files) for host in records] == [(plan.records, True)]
 
 
 @settings(max_examples=few(150), deadline=None)

@@ -5,7 +5,7 @@ import pytest
 from support import slow_twins as naive
 from support.effort import few
 from support.kernel_oracle import WALLS, loaded
-from support.planner_strategies import RULES, random_climb, random_pace
+from support.planner_strategies import RULES, inside, open_cell, random_climb, random_pace, random_window
 
 from planner_service.goal_tree_cache import GoalTrees
 from planner_service.kernels.queue_dial import NO_AIM
@@ -19,16 +19,12 @@ from swarm.wire.route_columns import RouteBatch, RouteStatus
 ROUNDING = 1e-5
 
 
-def open_cell(rng: np.random.Generator, pace: np.ndarray) -> int:
-    return int(rng.choice(np.flatnonzero(np.isfinite(pace))))
-
-
 def marked(rng: np.random.Generator, pace: np.ndarray, ratio: float) -> Window:
     """A patch of other ground, walls among it, of cells that stay in the range of paces."""
-    row, col = int(rng.integers(pace.shape[0])), int(rng.integers(pace.shape[1]))
-    patch = pace[row : row + int(rng.integers(1, 4)), col : col + int(rng.integers(1, 4))]
+    window = random_window(rng, pace, *rng.integers(1, 4, 2).tolist())
+    patch = inside(pace, window)
     patch[:] = random_pace(rng, *patch.shape, ratio, float(rng.choice([0.0, 0.3, 1.0])))
-    return Window(row, col, row + patch.shape[0], col + patch.shape[1])
+    return window
 
 
 def costs_of(growth: PartialGrowth, pace: np.ndarray) -> np.ndarray:
@@ -118,7 +114,8 @@ def test_lives_of_goals_on_a_map_that_changes_are_answered_as_by_dijkstra(kind: 
         for _ in range(25):
             if rng.random() < 0.4:
                 trees.changed(ground.apply(pace, [marked(rng, pace, ratio) for _ in range(rng.integers(1, 4))]))
-            goal, start = int(rng.choice(goals)), int(rng.integers(-1, pace.size + 1))
+            goal = int(rng.choice(goals))
+            start = int(rng.integers(pace.size)) if rng.random() < 0.95 else int(rng.choice([-1, pace.size]))
             found = trees.ask(goal, start, int(rng.choice([1, 40, 1 << 40])))
             route = found.route
             answered["lethal_goal" if found.lethal_goal else str(route.status)] += 1

@@ -7,10 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 from numpy.typing import NDArray
-from support.kernel_oracle import inner, loaded
+from support.kernel_oracle import grown, inner, loaded
 from support.slow_twins import cost_to_go
 
-from planner_service.tree.cost_to_go import CostToGoTree
 from shared_map.terrain.slope_and_climb import directional_factor
 from swarm.config.ground import CostConfig
 
@@ -59,9 +58,7 @@ def test_costs_to_go_equal_those_of_grass_on_the_same_file(tmp_path: Path) -> No
         there = np.isfinite(pace) & np.isfinite(mean)
         assert there.sum() > 3000
         np.testing.assert_allclose(theirs[there], mean[there], rtol=1e-4)
-        costs = loaded(pace, corner_cutting=True)
-        tree = CostToGoTree(costs)
-        tree.grow(root)
+        tree = grown(loaded(pace, corner_cutting=True), root)
         entered = theirs if pace is even else cost_to_go(pace, root, corner_cutting=True)
         np.testing.assert_allclose(inner(tree, tree.cost)[there], entered[there], rtol=1e-4)
 

@@ -2,13 +2,11 @@
 
 import os
 import sys
-import time
 from pathlib import Path
 
 import numpy as np
 import pytest
-from support import slow_twins as naive
-from support.kernel_oracle import RATIOS, assert_equals_dijkstra, grown, loaded, random_grids
+from support.kernel_oracle import loaded, random_grids
 from support.planner_strategies import RULES, random_pace
 from support.processes import words_of_python
 
@@ -22,22 +20,6 @@ from swarm.grid import GridSpec
 @pytest.mark.parametrize("grids", [2_000, pytest.param(10_000, marks=pytest.mark.thorough)])
 def test_random_grids_equal_dijkstra(grids: int) -> None:
     random_grids(grids, 2, 40)
-
-
-def test_scipy_equals_twelve_lines_that_can_be_read() -> None:
-    rng = np.random.default_rng(3)
-    for n in range(20):
-        pace = random_pace(rng, 9, 8, RATIOS[n % 7], 0.25)
-        rules = RULES[n % 5]
-        target = int(np.flatnonzero(np.isfinite(pace))[0])
-        by_hand = naive.cost_to_go_by_hand(pace, target, **rules)
-        np.testing.assert_allclose(naive.cost_to_go(pace, target, **rules), by_hand)
-
-
-@pytest.mark.parametrize("shape", [(1, 1), (1, 17), (17, 1), (2, 2)])
-@pytest.mark.parametrize("rules", RULES)
-def test_the_smallest_grids_equal_dijkstra(shape: tuple[int, int], rules: dict) -> None:
-    assert_equals_dijkstra(np.full(shape, 0.5, np.float32), 0, rules)
 
 
 @pytest.mark.parametrize("rules", RULES)
@@ -56,31 +38,6 @@ def test_buckets_and_wide_buckets_give_the_same_costs_to_the_last_bit(rules: dic
         reach = queue_wide_buckets.grow_by_wide_buckets(ground.padded, wide, root, width, room)
         np.testing.assert_array_equal(wide, narrow)
         assert reach >= wide[np.isfinite(wide)].max()
-
-
-@pytest.mark.parametrize("ratio", [1e4, 1e6, 1e9, 1e20])
-def test_no_ratio_of_paces_breaks_or_crawls(ratio: float) -> None:
-    rng = np.random.default_rng(6)
-    for walls in (0.0, 0.2):
-        pace = random_pace(rng, 120, 120, ratio, walls)
-        pace[pace < np.inf] = np.clip(pace[pace < np.inf], 2.0**-40, 2.0**40)  # as the door does
-        target = int(np.flatnonzero(np.isfinite(pace))[77])
-        for rules in RULES:
-            # 400 steps, each rounded by 2^-23 at most where costs drown in others.
-            assert_equals_dijkstra(pace, target, rules, 1e-5 if ratio < 1e12 else 400 * 2**-23)
-            begin = time.thread_time()
-            grown(pace, target, rules)
-            assert time.thread_time() - begin < 0.5  # 14,400 cells: 5 ms where nothing else runs
-
-
-def test_large_fields_of_every_kind_equal_dijkstra() -> None:
-    from support.fields import make_field
-
-    for name in ("terrain", "uniform", "maze"):
-        pace = make_field(name, 300)
-        target = int(np.flatnonzero(np.isfinite(pace))[1234])
-        assert_equals_dijkstra(pace, target, RULES[0])
-        assert_equals_dijkstra(pace, target, RULES[3])
 
 
 @pytest.mark.parametrize(

@@ -19,7 +19,6 @@ from swarm.errors import ProtocolError
 from swarm.wire.codec import (
     MAX_JSON_BYTES,
     decode,
-    decode_parameters,
     encode,
     encode_json,
     may_be_json,
@@ -28,7 +27,7 @@ from swarm.wire.codec import (
 from swarm.wire.messages import Message, schema_of
 from swarm.wire.messages.map_data import MarkSet
 from swarm.wire.messages.orders import GiveOrder
-from swarm.wire.messages.planning import CostRequest, PushedRoute, TargetPose
+from swarm.wire.messages.planning import PushedRoute, TargetPose
 from swarm.wire.messages.vehicles import Obstacle
 from swarm.wire.topics import TOPICS
 
@@ -171,16 +170,6 @@ def test_mutations_of_json_raise_nothing_but_protocol_errors():
         except ProtocolError:
             pass
     assert 0 < accepted < few(20_000) // 2
-
-
-def test_a_reply_has_one_format_beside_messagepack() -> None:
-    assert decode_parameters({"row": "4", "col": "2", "format": "json"}, CostRequest).row == 4
-    with pytest.raises(ProtocolError, match="format: found 'xml', expected 'json'"):
-        decode_parameters({"row": "4", "col": "2", "format": "xml"}, CostRequest)
-
-
-def test_a_request_may_be_json_too():
-    assert read('{"row": 4, "col": 2}', CostRequest) == CostRequest(row=4, col=2)
 
 
 def test_a_key_with_a_number_of_any_length_is_refused() -> None:

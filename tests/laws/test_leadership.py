@@ -1,7 +1,6 @@
 """Leadership: at most one leader among those who hear each other, soon one after every fault, no change without
 cause."""
 
-import heapq
 import random
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -9,7 +8,8 @@ from dataclasses import dataclass, field
 import pytest
 from support.effort import few
 
-from swarm.clock import NS_PER_S
+from swarm.bus.scheduler import Scheduler
+from swarm.clock import NS_PER_S, ManualClock
 from swarm.peers import job_of, ranked_id, split_rank
 from swarm.runtime.election import HEARTBEAT_NS, LEASE_NS, SETTLED_NS, Leadership
 from swarm.wire.messages.processes import Heartbeat
@@ -45,9 +45,8 @@ class World:
     def __init__(self, seed: int, count: int, lossy: float) -> None:
         self.chance = random.Random(seed)
         self.lossy = lossy
-        self.now_ns = 0
-        self.events: list[tuple[int, int, Callable[[], None]]] = []
-        self.number = 0
+        self.scheduler = Scheduler(ManualClock(0))
+        self.look: Callable[[], None] = lambda: None
         self.far: set[int] = set()
         self.disturbed_ns = 0
         """Time of the last fault, or of its end."""
@@ -62,16 +61,20 @@ class World:
         for each in self.all:
             self.boot(each)
 
+    @property
+    def now_ns(self) -> int:
+        return self.scheduler.clock.now_ns()
+
     def at(self, when_ns: int, action: Callable[[], None]) -> None:
-        self.number += 1
-        heapq.heappush(self.events, (when_ns, self.number, action))
+        def happen() -> None:
+            action()
+            self.look()
+
+        self.scheduler.at(when_ns, happen)
 
     def run(self, until_ns: int, look: Callable[[], None] = lambda: None) -> None:
-        while self.events and self.events[0][0] <= until_ns:
-            self.now_ns, _, action = heapq.heappop(self.events)
-            action()
-            look()
-        self.now_ns = until_ns
+        self.look = look
+        self.scheduler.run_until(until_ns)
 
     # --- what happens to candidates -------------------------------------------------------------------------
 

@@ -39,35 +39,41 @@ def scribble(swarm: SwarmModel, chance: random.Random, author: SyncService, mark
     author.sync.publish(author.replica.write(cells, kinds, 2.0, swarm.now_ns))
 
 
+class Writers(SwarmModel):
+    """A keeper, four authors that write at random, and a planner that listens."""
+
+    def __init__(self, seed: int, links: LossyLinks) -> None:
+        super().__init__(links)
+        self.chance = random.Random(seed)
+        self.keepers = [self.keeper("keeper", KeeperStore(":memory:"))]
+        self.authors = [self.writer(f"a{n}.1") for n in range(4)]
+        self.listeners = [self.listener("p")]
+
+    def write(self, times: int, every_s: float) -> None:
+        for _ in range(times):
+            scribble(self, self.chance, self.chance.choice(self.authors), 5)
+            self.run(every_s)
+
+    def until_equal_s(self) -> float:
+        return until_equal_s(self, [*self.keepers, *self.listeners, *self.authors])
+
+
 def after_loss_s(seed: int) -> float:
-    """4 authors, a planner and a keeper write for 10 s at 30 % lost, 10 % doubled, 500 ms jitter; then quiet, with
-    the links as bad as before."""
-    chance = random.Random(seed)
-    swarm = SwarmModel(LossyLinks(seed, dropped=0.3, repeated=0.1, jitter_ms=500))
-    keeper = swarm.keeper("keeper", KeeperStore(":memory:"))
-    authors = [swarm.writer(f"a{n}.1") for n in range(4)]
-    listener = swarm.listener("p")
-    for _ in range(50):
-        scribble(swarm, chance, chance.choice(authors), 5)
-        swarm.run(0.2)
-    return until_equal_s(swarm, [keeper, listener, *authors])
+    """All write for 10 s at 30 % lost, 10 % doubled, 500 ms jitter; then quiet, with the links as bad as before."""
+    swarm = Writers(seed, LossyLinks(seed, dropped=0.3, repeated=0.1, jitter_ms=500))
+    swarm.write(50, 0.2)
+    return swarm.until_equal_s()
 
 
 def after_partition_s(seed: int) -> float:
     """Writes on both sides of a partition of 30 s; from its healing on."""
-    chance = random.Random(seed)
     links = LossyLinks(seed)
-    swarm = SwarmModel(links)
-    keeper = swarm.keeper("keeper", KeeperStore(":memory:"))
-    authors = [swarm.writer(f"a{n}.1") for n in range(4)]
-    listener = swarm.listener("p")
-    swarm.run(2 + chance.random())
+    swarm = Writers(seed, links)
+    swarm.run(2 + swarm.chance.random())
     links.far_side = {"a2.1", "a3.1", "p"}
-    for _ in range(100):
-        scribble(swarm, chance, chance.choice(authors), 5)
-        swarm.run(0.3)
+    swarm.write(100, 0.3)
     links.far_side = set()
-    return until_equal_s(swarm, [keeper, listener, *authors])
+    return swarm.until_equal_s()
 
 
 def lost_while_coming_and_going(seed: int, marks: int, agents: int = 6) -> dict[str, float]:

@@ -12,7 +12,16 @@ from weakref import ref
 import msgspec
 import numpy as np
 import pytest
-from support.map_strategies import GRID, Acknowledged, Composite, held_winners, naive_winners, set_of, sets_asked
+from support.map_strategies import (
+    GRID,
+    Acknowledged,
+    Composite,
+    held_winners,
+    naive_winners,
+    replica_of,
+    set_of,
+    sets_asked,
+)
 from support.message_fuzzer import mutated
 from support.swarm_model import SwarmModel
 
@@ -51,12 +60,7 @@ def survivors(payloads: list[bytes], kind: type[M], chance: random.Random) -> li
 def test_mutated_sets_merge_by_the_rules_or_not_at_all() -> None:
     through = survivors([encode(each) for each in examples()], MarkSet, random.Random(4))
     assert len(through) > MUTATIONS // 100, "too few came through to say anything"
-    replicas = []
-    for order in (through, through[::-1]):
-        replica = MapReplica(GRID, Composite())
-        for each in order:
-            replica.merge([each])
-        replicas.append(replica)
+    replicas = [replica_of(order)[0] for order in (through, through[::-1])]
     lasting = [each for each in through if fault(each, GRID) is None]
     if not any(each.untils_ns for each in lasting):
         assert held_winners(replicas[0]) == naive_winners(lasting)
@@ -68,10 +72,9 @@ def test_mutated_messages_of_many_sets_merge_by_the_rules_or_not_at_all() -> Non
     messages = survivors([encode(message) for message in packed(examples())], MarkSets, random.Random(6))
     through = [each for message in messages for each in unpacked(message)]
     assert len(through) > MUTATIONS // 100, "too few came through to say anything"
-    singly, together = MapReplica(GRID, Composite()), MapReplica(GRID, Composite())
     for each in through:
         each.check()  # what the columns pass, each set passes by itself
-        singly.merge([each])
+    singly, together = replica_of(through)[0], MapReplica(GRID, Composite())
     for first in range(0, len(through), 500):
         together.merge(through[first : first + 500])
     assert sets_asked(together, MarksRequest()) == sets_asked(singly, MarksRequest())
@@ -132,9 +135,7 @@ def test_mutated_payloads_on_the_bus_neither_stop_a_service_nor_keep_true_marks_
 
 
 def test_requests_for_what_no_one_has_are_answered_with_nothing() -> None:
-    replica = MapReplica(GRID)
-    for each in examples():
-        replica.merge([each])
+    replica, _ = replica_of(examples())
     odd = msgspec.structs.replace(FEW, authors=["x" * 64], tiles=[10**9])
     assert sets_asked(replica, odd) == []
     assert replica.missing({"a1.1": np.array([(4_000_000_000, 9, 9)], DIGEST_ROW).tobytes()}) == []

@@ -8,7 +8,7 @@ import pytest
 from support import slow_twins as naive
 from support.effort import few
 from support.makers import target_pose
-from support.planner_strategies import STRATEGIES, random_pace
+from support.planner_strategies import STRATEGIES, open_cell, random_pace
 from support.scripted_planner import TICK, TRACKED, World, chasers
 
 from planner_service.followers import LONGEST_WAIT_NS
@@ -19,7 +19,7 @@ from planner_service.tracker_notes import TargetWatch
 from shared_map.cost_map import CostMap
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.clock import NS_PER_S
-from swarm.config.scenario import PlannerConfig
+from swarm.config.scenario import PlannerConfig, Strategy
 from swarm.grid import walk
 from swarm.runtime.stats import Counters
 from swarm.wire.messages.map_data import MarkKind
@@ -32,15 +32,15 @@ SIDE = 24
 class Watched:
     """A planner whose map changes in every tick, and what of its tree was behind the map for how long."""
 
-    def __init__(self, seed: int) -> None:
+    def __init__(self, seed: int, hidden: Hidden = TRACKED, strategy: Strategy | None = None) -> None:
         self.rng = rng = np.random.default_rng(seed)
         self.map = CostMap(terrain_of_pace(random_pace(rng, SIDE, SIDE, 5.0, (0.0, 0.15, 0.3)[seed % 3])))
         self.grid = self.map.grid
-        config = PlannerConfig(strategy=STRATEGIES[seed // 3 % len(STRATEGIES)])  # type: ignore[arg-type]
+        config = PlannerConfig(strategy=strategy or STRATEGIES[seed // 3 % len(STRATEGIES)])  # type: ignore[arg-type]
         tree = TargetTree(self.grid, config)
         self.watch = TargetWatch("t0", self.grid, Counters())
-        search = TargetSearch(TRACKED, tree.cost_grid, 1.0)
-        self.planner = Planner(self.watch, 7, config, tree, self.map, Counters(), target_search=search)
+        self.search = TargetSearch(hidden, tree.cost_grid, 1.0)
+        self.planner = Planner(self.watch, 7, config, tree, self.map, Counters(), target_search=self.search)
         self.now_ns = self.seq = 0
         self.at: int | None = None
         """The target's place."""
@@ -48,6 +48,19 @@ class Watched:
         self.told_at: dict[int, int] = {}
         """Version of the map -> when there was one first."""
         self.pose()
+
+    def live(self, steps: int) -> None:
+        self.tick()
+        for _ in range(steps):
+            happens = self.rng.integers(6)
+            if happens == 0:
+                self.pose()
+            elif happens < 4:
+                self.mark()
+            else:
+                self.ask()
+            if self.rng.integers(3) == 0:
+                self.tick()
 
     def pose(self) -> None:
         open_ = np.flatnonzero(np.isfinite(self.map.pace_s_per_m))
@@ -107,49 +120,27 @@ class Watched:
         return int(found.last[0])
 
 
-def test_no_route_leads_through_a_change_that_waits_and_none_waits_for_long() -> None:
-    routes = waited = 0
-    for seed in range(few(96)):
-        watched = Watched(seed)
-        watched.tick()
-        for _ in range(40):
-            happens = watched.rng.integers(6)
-            if happens == 0:
-                watched.pose()
-            elif happens < 4:
-                watched.mark()
-            else:
-                watched.ask()
-            if watched.rng.integers(3) == 0:
-                watched.tick()
-        routes, waited = routes + watched.routes, waited + watched.waited
-    assert routes > 100
-    assert waited > 10, "every change was taken in at once"
-
-
 class Searched(Watched):
     """The same for an unseen target, once its planner has begun to search for it."""
 
     def __init__(self, seed: int) -> None:
-        super().__init__(seed)
-        grid, config = self.grid, PlannerConfig(strategy="exact")
-        tree = TargetTree(grid, config)
         hidden = Hidden(
             tracked=False, sense_range_m=4.0, capture_range_m=1.0, slowness=2.0, jumps=False, seed=str(seed)
         )
-        search = TargetSearch(hidden, tree.cost_grid, 1.0)
-        self.watch = TargetWatch("t0", grid, Counters())
-        self.planner = Planner(self.watch, 7, config, tree, self.map, Counters(), target_search=search)
+        super().__init__(seed, hidden, "exact")
         if seed % 2:  # seen once; else never
-            cell = int(self.rng.choice(np.flatnonzero(np.isfinite(self.map.pace_s_per_m))))
-            seen = target_pose("t0", cell, grid)
+            grid = self.grid
+            seen = target_pose("t0", open_cell(self.rng, self.map.pace_s_per_m), grid)
             self.watch.on_sighting(seen, 0)
             east_m, south_m = np.array([seen.x_m - grid.west_m]), np.array([grid.north_m - seen.y_m])
-            search.hear_vehicles(east_m.astype(np.float32), south_m.astype(np.float32))
-        while not search.active:
+            self.search.hear_vehicles(east_m.astype(np.float32), south_m.astype(np.float32))
+        while not self.search.active:
             self.now_ns += TICK
             self.planner.tick(self.now_ns)
             assert self.now_ns < 10 * NS_PER_S
+
+    def pose(self) -> None:
+        """It is never seen again."""
 
     def check(self, route: Route) -> None:
         if route.status is not RouteStatus.SEARCHING or not route.directions:
@@ -158,19 +149,17 @@ class Searched(Watched):
         self.driven(route)
 
 
-def test_no_one_is_sent_to_look_for_a_target_through_a_change_that_waits() -> None:
-    routes = 0
-    for seed in range(few(33)):
-        watched = Searched(seed)
-        for _ in range(60):
-            if watched.rng.integers(3):
-                watched.mark()
-            else:
-                watched.ask()
-            if watched.rng.integers(3) == 0:
-                watched.tick()
-        routes += watched.routes
+@pytest.mark.parametrize(("kind", "lives"), [(Watched, 96), (Searched, 33)])
+def test_no_one_is_sent_through_a_change_that_waits_and_none_waits_for_long(
+    kind: type[Watched], lives: int
+) -> None:
+    routes = waited = 0
+    for seed in range(few(lives)):
+        watched = kind(seed)
+        watched.live(50)
+        routes, waited = routes + watched.routes, waited + watched.waited
     assert routes > 100
+    assert waited > 10, "every change was taken in at once"
 
 
 def test_routes_are_read_as_places_as_they_are_walked() -> None:

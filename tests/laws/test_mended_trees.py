@@ -10,9 +10,22 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support import slow_twins as naive
 from support.effort import few
-from support.kernel_oracle import inner, loaded
+from support.kernel_oracle import grown, inner, loaded
 from support.planner_play import Play
-from support.planner_strategies import RULES, Job, Marks, Move, happenings, random_climb, random_pace
+from support.planner_strategies import (
+    RULES,
+    Job,
+    Marks,
+    Move,
+    cell_near,
+    change,
+    happenings,
+    inside,
+    open_cell,
+    random_climb,
+    random_pace,
+    random_window,
+)
 
 from planner_service import target_tree
 from planner_service.kernels import repair as kernels
@@ -44,10 +57,9 @@ class Patchwork:
         self.pace = pace
         self.grid = GridSpec(*pace.shape, 1.0)
         self.climb = climb
-        self.config = PlannerConfig(**rules)
+        self.rules = rules
         self.costs = self._fresh()
-        self.tree = CostToGoTree(self.costs)
-        self.tree.grow(int(rng.choice(np.flatnonzero(np.isfinite(pace)))))
+        self.tree = grown(self.costs, open_cell(rng, pace))
         self.mended = 0
 
     @property
@@ -55,22 +67,14 @@ class Patchwork:
         return self.tree.root
 
     def _fresh(self) -> CostGrid:
-        costs = CostGrid(self.grid, self.config, self.climb)
-        costs.load(self.pace)
-        return costs
+        return loaded(self.pace, self.grid, self.climb, **self.rules)
 
     def change(self, factor: float, side: int, near_root: bool = False) -> Window:
         """Changes a square somewhere, or around the root. The root stays passable."""
-        rows, cols = self.grid.rows, self.grid.cols
-        row, col = int(self.rng.integers(rows)), int(self.rng.integers(cols))
+        window = random_window(self.rng, self.pace, side, side)
         if near_root:
-            row, col = (max(at - side // 2, 0) for at in self.grid.row_col(self.root))
-        window = Window(row, col, min(row + side, rows), min(col + side, cols))
-        patch = self.pace[window.row0 : window.row1, window.col0 : window.col1]
-        if factor == 0.0:
-            patch[:] = random_pace(self.rng, *patch.shape, 5.0, 0.3)
-        else:
-            patch *= np.float32(factor)
+            window = self.grid.around(self.root, side // 2)
+        change(self.rng, inside(self.pace, window), factor)
         if not np.isfinite(self.pace.flat[self.root]):
             self.pace.flat[self.root] = 1.0
         return window
@@ -93,22 +97,19 @@ class Patchwork:
         return self.costs.padded, self.costs.climbs, labels, changes.cells, changes.before
 
     def check(self) -> None:
-        fresh = CostToGoTree(self._fresh())
-        fresh.grow(self.root)
+        fresh = grown(self._fresh(), self.root)
         np.testing.assert_array_equal(inner(self.tree, self.tree.cost), inner(fresh, fresh.cost))
         np.testing.assert_array_equal(inner(self.tree, self.tree.parent), inner(fresh, fresh.parent))
         assert self.tree.reach >= fresh.cost[np.isfinite(fresh.cost)].max()
 
-    def check_lowered(self) -> int:
-        """A heuristic without parents that is lowered is the tree of the map that got cheaper. Returns how many
-        cells changed."""
+    def lower(self) -> None:
+        """A heuristic without parents that is lowered is the tree of the map that got cheaper."""
         changes = self.costs.apply(self.pace, [self.change(factor, 6) for factor in (0.5, 0.25, 0.9)])
         heuristic = self.tree.cost.copy()
         given = self._given((heuristic, np.empty(0, np.uint8), 0), changes)
-        done, _ = kernels.repair(*given, self.costs.buckets, (0, 0, NO_LIMIT), self.costs.repair_scratch)
+        kernels.repair(*given, self.costs.buckets, (0, 0, NO_LIMIT), self.costs.repair_scratch)
         self.tree.grow(self.root)
         np.testing.assert_array_equal(inner(self.tree, heuristic), inner(self.tree, self.tree.cost))
-        return int(done)
 
 
 WAYS_TO_PRICE: tuple[dict[str, Any], ...] = (*RULES, {"length_weight": 0.5}, {"directional": True})
@@ -142,15 +143,12 @@ class Mended(Patchwork):
                 self.mend([self.change(factor, side) for factor in factors])
 
     def _move(self, far: int) -> None:
-        grid, tree = self.costs.grid, self.tree
-        row, col = grid.row_col(tree.root)
-        row = int(np.clip(row + self.rng.integers(-far, far + 1), 0, grid.rows - 1))
-        col = int(np.clip(col + self.rng.integers(-far, far + 1), 0, grid.cols - 1))
-        window = grid.around(grid.cell(row, col), far + int(self.rng.integers(0, 4)))
-        if np.isfinite(self.pace[row, col]) and tree.move(grid.cell(row, col), window):
+        cell = cell_near(self.rng, self.grid, self.root, far)
+        window = self.grid.around(cell, far + int(self.rng.integers(0, 4)))
+        if np.isfinite(self.pace.flat[cell]) and self.tree.move(cell, window):
             self.done += 1
             if self.rng.integers(4) == 0:
-                tree.grow_strides(window, self.strides, 64)
+                self.tree.grow_strides(window, self.strides, 64)
 
     def check_mended(self) -> None:
         self.tree.mend()
@@ -159,8 +157,7 @@ class Mended(Patchwork):
             assert self.tree.offset == 0.0
             self.check()
             return
-        fresh = CostToGoTree(self.costs)
-        fresh.grow(self.root)
+        fresh = grown(self.costs, self.root)
         finite = np.isfinite(fresh.cost)
         assert (self.tree.cost[finite] >= fresh.cost[finite]).all()
         self.tree.grow(self.root)
@@ -186,8 +183,7 @@ def test_where_nothing_is_left_of_the_old_order_mending_gives_up_and_says_so() -
     way."""
     rng = np.random.default_rng(3)
     pace = random_pace(rng, 60, 60, 100.0, 0.1)
-    costs = loaded(pace)
-    root = int(rng.choice(np.flatnonzero(np.isfinite(pace))))
+    costs, root = loaded(pace), open_cell(rng, pace)
     tree = CostToGoTree(costs)
     given_up = 0
     for _ in range(6):
@@ -211,11 +207,8 @@ def test_where_nothing_is_left_of_the_old_order_mending_gives_up_and_says_so() -
 def test_a_tree_whose_costs_are_too_large_for_its_parents_to_be_trusted_is_not_repaired() -> None:
     pace = np.ones((30, 30), np.float32)
     pace[:, 15] = 1e9
-    costs = loaded(pace)
-    tree = CostToGoTree(costs)
-    tree.grow(0)
     with pytest.raises(ValueError, match="grow the tree"):
-        tree.mend()
+        grown(loaded(pace), 0).mend()
 
 
 @given(st.integers(0, 2**32 - 1), st.sampled_from(WAYS_TO_PRICE), happenings(14))
@@ -252,26 +245,6 @@ def patchwork(rng: np.random.Generator, pace: Floats, n: int, directed: bool) ->
     return Patchwork(rng, pace, RULES[n % 5], climb)
 
 
-def trials(count: int, seed: int, shape: tuple[int, int], most_side: int, directed: bool = False) -> int:
-    """Number of changes, on maps of all kinds, that were repaired without a fallback."""
-    mended = 0
-    for n in range(0, count, 12):
-        rng = np.random.default_rng([seed, n])
-        ratio, walls = (1.0, 4.0, 30.0, 1000.0)[n // 12 % 4], (0.0, 0.15, 0.35)[n // 48 % 3]
-        work = patchwork(rng, random_pace(rng, *shape, ratio, walls), n // 12, directed)
-        for m in range(12):
-            # Every other time several patches at once, of different kinds and sizes.
-            parts = [FACTORS[(m + part) % 6] for part in range(1 if m % 2 else 3)]
-            windows = [
-                work.change(factor, int(rng.integers(1, most_side + 1)), bool(rng.random() < 0.2))
-                for factor in parts
-            ]
-            work.mend(windows)
-            work.check()
-        mended += work.mended
-    return mended
-
-
 @pytest.mark.parametrize(
     ("count", "shape", "most_side", "directed"),
     [
@@ -283,7 +256,23 @@ def trials(count: int, seed: int, shape: tuple[int, int], most_side: int, direct
 def test_repaired_trees_are_those_that_would_have_grown_in_every_cost_and_parent(
     count: int, shape: tuple[int, int], most_side: int, directed: bool
 ) -> None:
-    assert trials(count, 1, shape, most_side, directed) > count // 3
+    """On maps of all kinds; a third of all changes is repaired without a fallback."""
+    mended = 0
+    for n in range(count // 12):
+        rng = np.random.default_rng([1, 12 * n])
+        pace = random_pace(rng, *shape, (1.0, 4.0, 30.0, 1000.0)[n % 4], (0.0, 0.15, 0.35)[n // 4 % 3])
+        work = patchwork(rng, pace, n, directed)
+        for m in range(12):
+            # Every other time several patches at once, of different kinds and sizes.
+            parts = [FACTORS[(m + part) % 6] for part in range(1 if m % 2 else 3)]
+            windows = [
+                work.change(factor, int(rng.integers(1, most_side + 1)), bool(rng.random() < 0.2))
+                for factor in parts
+            ]
+            work.mend(windows)
+            work.check()
+        mended += work.mended
+    assert mended > count // 3
 
 
 @pytest.mark.parametrize("rules", RULES)
@@ -294,19 +283,6 @@ def test_a_repair_may_concern_the_whole_map(rules: dict) -> None:
         work.pace *= np.float32(factor)
         assert work.repair_at_any_price(work.costs.apply(work.pace, [work.grid.window])) > 1000
         work.check()
-
-
-def test_a_wall_across_the_map_takes_the_way_from_all_behind_it_and_a_door_gives_it_back() -> None:
-    work = Patchwork(np.random.default_rng(1), np.ones((30, 30), np.float32), RULES[0])
-    work.tree.grow(work.grid.cell(2, 2))
-    work.pace[15] = np.inf
-    work.mend([Window(15, 0, 16, 30)])
-    work.check()
-    assert np.isinf(inner(work.tree, work.tree.cost)[16:]).all()
-    work.pace[15, 29] = 1.0
-    work.mend([Window(15, 29, 16, 30)])
-    work.check()
-    assert np.isfinite(inner(work.tree, work.tree.cost)[16:]).all()
 
 
 def test_a_repair_that_concerns_too_much_gives_way() -> None:
@@ -334,4 +310,4 @@ def test_costs_do_not_depend_on_the_width_or_number_of_buckets(width: float, cou
 def test_a_lowered_heuristic_is_the_tree_of_a_map_that_got_cheaper(directed: bool) -> None:
     rng = np.random.default_rng(6)
     for n in range(60):
-        patchwork(rng, random_pace(rng, 40, 45, 6.0, 0.2), n, directed).check_lowered()
+        patchwork(rng, random_pace(rng, 40, 45, 6.0, 0.2), n, directed).lower()

@@ -35,6 +35,13 @@ def _both_ways(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) 
     monkeypatch.setattr(merge_module, "_FEW", request.param)
 
 
+def begun() -> tuple[MapReplica, drawn.Composite]:
+    """A replica at time 3, when some statements have ended, and its map."""
+    replica, composite = drawn.replica_of([])
+    replica.tick(3)
+    return replica, composite
+
+
 def assert_equal_now_and_later(
     together: MapReplica, many: drawn.Composite, singly: MapReplica, single: drawn.Composite
 ) -> None:
@@ -56,10 +63,7 @@ def assert_equal_now_and_later(
 def test_many_at_once_in_any_order_grouping_and_repetition_are_as_one_by_one(
     sets: list[MarkSet], data: st.DataObject
 ) -> None:
-    singly, single = drawn.replica_of([])
-    together, many = drawn.replica_of([])
-    singly.tick(3)
-    together.tick(3)
+    (singly, single), (together, many) = begun(), begun()
     for each in sets:
         singly.merge([each])
     again = data.draw(st.lists(st.sampled_from(sets), max_size=10)) if sets else []
@@ -174,11 +178,9 @@ def test_beyond_its_share_an_author_is_refused_and_the_others_are_not() -> None:
 
 
 def test_what_has_no_room_is_not_asked_for_again() -> None:
-    whole, _ = drawn.replica_of([])
-    whole.merge([drawn.set_of("a", tile, 1, {0: (LETHAL, 0, 1)}) for tile in range(4)])
+    whole, _ = drawn.replica_of([drawn.set_of("a", tile, 1, {0: (LETHAL, 0, 1)}) for tile in range(4)])
     bounded = MapReplica(drawn.GRID, capacity=Capacity(max_sets=8))
-    for each in drawn.sets_asked(whole, MarksRequest()):
-        bounded.merge([each])
+    bounded.merge(drawn.sets_asked(whole, MarksRequest()))
     assert bounded.missing(whole.held.ledger.held()) == []
     whole.merge([drawn.set_of("a", 1, 2, {})])
     assert bounded.missing(whole.held.ledger.held()) == [("a", [1])]  # what it has is kept up to date
@@ -196,10 +198,7 @@ def test_messages_of_many_sets_merge_as_these_one_by_one(
     sets: list[MarkSet], cut: int, data: st.DataObject
 ) -> None:
     """Also after other sets and tombstones were heard, in any order of the messages."""
-    singly, single = drawn.replica_of([])
-    together, many = drawn.replica_of([])
-    singly.tick(3)
-    together.tick(3)
+    (singly, single), (together, many) = begun(), begun()
     for each in sets[:cut]:
         singly.merge([each])
         together.merge([each])

@@ -17,7 +17,10 @@ SCENARIOS = sorted(DATA.glob("*/*.scen"))
 QUICK = 60
 
 
-def assert_lengths(scenario: Path, most: int | None) -> None:
+@pytest.mark.parametrize("most", [QUICK, pytest.param(None, marks=[pytest.mark.slow, pytest.mark.thorough])])
+@pytest.mark.parametrize("scenario", SCENARIOS, ids=lambda path: path.name)
+def test_problems_have_the_published_lengths(scenario: Path, most: int | None) -> None:
+    """A sample of each file, or all."""
     pace = from_file(scenario.with_suffix(""))
     grid = GridSpec(pace.shape[0], pace.shape[1], 1.0)
     lines = [line.split() for line in scenario.read_text(encoding="utf-8").splitlines()[1:] if line]
@@ -41,15 +44,3 @@ def assert_lengths(scenario: Path, most: int | None) -> None:
             slack = 0.5 * 10.0**-digits + 5e-8 * route.length_m
             assert abs(route.length_m - float(line[8])) <= slack, (scenario.name, line)
             np.testing.assert_allclose(route.cost_s, route.length_m)
-
-
-@pytest.mark.parametrize("scenario", SCENARIOS, ids=lambda path: path.name)
-def test_a_sample_of_problems_has_the_published_lengths(scenario: Path) -> None:
-    assert_lengths(scenario, QUICK)
-
-
-@pytest.mark.slow
-@pytest.mark.thorough
-@pytest.mark.parametrize("scenario", SCENARIOS, ids=lambda path: path.name)
-def test_every_problem_has_the_published_length(scenario: Path) -> None:
-    assert_lengths(scenario, None)

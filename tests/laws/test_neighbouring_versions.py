@@ -192,12 +192,8 @@ def test_every_message_that_the_version_before_has_written_is_read_as_it_was_mea
 
 def test_the_version_before_reads_every_message_of_this_one(tmp_path: Path) -> None:
     tree = neighbour_tree(tmp_path)
-    script = ROOT / "tests" / "support" / "wire_specimens.py"
     said = lines(few(50))
-    answered = subprocess.run(
-        [sys.executable, str(script), "read"], input="\n".join(said), env=environment_of(tree),
-        capture_output=True, text=True, timeout=120, check=True,
-    )  # fmt: skip
+    answered = called(tree, "wire_specimens.py", "read", input="\n".join(said))
     answers = answered.stdout.splitlines()
     assert len(answers) == len(said), answered.stderr
     heard = [pair for pair in zip(said, answers, strict=True) if pair[1] != "unknown"]
@@ -208,14 +204,11 @@ def test_the_version_before_reads_every_message_of_this_one(tmp_path: Path) -> N
 
 
 def test_files_of_the_version_before_are_read_and_it_refuses_ours_in_a_sentence(tmp_path: Path) -> None:
-    script, old = ROOT / "tests" / "support" / "stored_by.py", neighbour_tree(tmp_path)
+    old = neighbour_tree(tmp_path)
 
     def stored(what: str, tree: Path, folder: str) -> subprocess.CompletedProcess[str]:
         (tmp_path / folder).mkdir(exist_ok=True)
-        command = [sys.executable, str(script), what, str(tmp_path / folder)]
-        return subprocess.run(
-            command, env=environment_of(tree), capture_output=True, text=True, timeout=120, check=False
-        )
+        return called(tree, "stored_by.py", what, str(tmp_path / folder))
 
     stored("write", old, "older")
     found = [stored("read", tree, "older").stdout for tree in (old, ROOT)]
@@ -227,6 +220,14 @@ def test_files_of_the_version_before_are_read_and_it_refuses_ours_in_a_sentence(
         assert {name: heard[name] for name in both} == {name: meant[name] for name in both}
     stored("write", ROOT, "newer")
     assert "StoreError: cannot open the store" in stored("read", old, "newer").stderr
+
+
+def called(tree: Path, script: str, *words: str, **options: Any) -> subprocess.CompletedProcess[str]:
+    """A script of `tests/support` that has run on the packages of a tree."""
+    command = [sys.executable, str(ROOT / "tests" / "support" / script), *words]
+    return subprocess.run(
+        command, env=environment_of(tree), capture_output=True, text=True, timeout=120, check=False, **options
+    )
 
 
 def check_same(line: str, answer: str) -> None:

@@ -65,45 +65,55 @@ def touched(x_m: float, y_m: float, heading_rad: float | None, ahead_m: float, r
 @dataclass
 class Heard:
     report: Obstacle
-    at_ns: int
     awake_ns: int = 0
     """Time for which the process has listened since."""
+
+    @property
+    def sender(self) -> tuple[str, int]:
+        return self.report.id, self.report.incarnation
+
+    @property
+    def lasts(self) -> bool:
+        return self.awake_ns < self.report.lease_s * NS_PER_S
+
+    def closes(self, more_m: float = 0.0, most_m: float = math.inf, wider_m: float = 0.0) -> set[int]:
+        """The cells on its way, which may be longer by some metres, and end after some."""
+        said = self.report
+        ahead_m = min(said.speed_m_per_s * (self.awake_ns / NS_PER_S + REACTION_S), most_m) + more_m
+        return touched(said.x_m, said.y_m, said.heading_rad, ahead_m, said.radius_m + MARGIN_M + wider_m)
 
 
 @dataclass
 class Twin:
-    """Every report, and what must be closed by them."""
+    """Reports, those of each sender in the order of their numbers, and what must be closed by them."""
 
     heard: list[Heard] = field(default_factory=list)
 
-    def newest(self) -> list[Heard]:
-        newest: dict[tuple[str, int], Heard] = {}
+    def listen(self, for_ns: int) -> None:
+        """A process that is stopped for longer than a quarter of a second has not listened since then."""
         for each in self.heard:
-            key = each.report.id, each.report.incarnation
-            if key not in newest or each.report.seq > newest[key].report.seq:
-                newest[key] = each
-        return [each for each in newest.values() if each.awake_ns < each.report.lease_s * NS_PER_S]
+            each.awake_ns += min(for_ns, NS_PER_S // 4)
+
+    @property
+    def newest(self) -> dict[tuple[str, int], Heard]:
+        return {each.sender: each for each in self.heard}
+
+    def hear(self, report: Obstacle) -> None:
+        """Takes in a report, unless a lasting one of its sender is as new."""
+        new = Heard(report)
+        before = self.newest.get(new.sender)
+        if before is None or not before.lasts or report.seq > before.report.seq:
+            self.heard = [each for each in self.heard if each.sender != new.sender or each.report.seq < report.seq]
+            self.heard.append(new)
 
     def must(self) -> set[int]:
-        closed: set[int] = set()
-        for each in self.newest():
-            report = each.report
-            ahead_m = min(report.speed_m_per_s * (each.awake_ns / NS_PER_S + REACTION_S), 64 * GRID.resolution_m)
-            closed |= touched(report.x_m, report.y_m, report.heading_rad, ahead_m, report.radius_m + MARGIN_M)
-        return closed
+        most_m = 64 * GRID.resolution_m
+        return set().union(*(each.closes(most_m=most_m) for each in self.newest.values() if each.lasts))
 
     def may(self) -> set[int]:
         """All claims of reports whose lease lasts."""
-        closed: set[int] = set()
-        for each in self.heard:
-            report = each.report
-            if each.awake_ns >= report.lease_s * NS_PER_S:
-                continue
-            step_m = 0.5 * GRID.resolution_m
-            ahead_m = report.speed_m_per_s * (each.awake_ns / NS_PER_S + REACTION_S) + step_m
-            wide_m = report.radius_m + MARGIN_M + SLACK_M
-            closed |= touched(report.x_m, report.y_m, report.heading_rad, ahead_m, wide_m)
-        return closed
+        more_m = 0.5 * GRID.resolution_m
+        return set().union(*(each.closes(more_m, wider_m=SLACK_M) for each in self.heard if each.lasts))
 
 
 places_x = st.floats(GRID.west_m, GRID.west_m + EAST_M)
@@ -131,27 +141,11 @@ def test_a_cell_is_closed_while_any_sender_says_so_and_open_once_no_one_does(ste
     obstacles.tick(now_ns)
     for said, pause_ns in steps:
         now_ns += pause_ns
-        for each in twin.heard:
-            # A process that is stopped for longer than a quarter of a second has not listened since then.
-            each.awake_ns += min(pause_ns, NS_PER_S // 4)
+        twin.listen(pause_ns)
         obstacles.tick(now_ns)
         for report in said:
-            known = [
-                each.report.seq
-                for each in twin.newest()
-                if (each.report.id, each.report.incarnation) == (report.id, report.incarnation)
-            ]
-            if known and report.seq <= known[0]:
-                obstacles.take_report(report, now_ns)
-                continue
-            twin.heard = [
-                each
-                for each in twin.heard
-                if (each.report.id, each.report.incarnation, each.report.seq >= report.seq)
-                != (report.id, report.incarnation, True)
-            ]
             obstacles.take_report(report, now_ns)
-            twin.heard.append(Heard(report, now_ns))
+            twin.hear(report)
         closed = {cell for cell in range(GRID.cells) if cell in obstacles.closed}
         assert twin.must() <= closed
         if all(each.report.speed_m_per_s < 100 for each in twin.heard):
@@ -220,8 +214,7 @@ def drive(seed: int, ticks: int = 60) -> Driven:
     for number in range(ticks):
         passed_ns = chance.choice((TICK_NS, TICK_NS, TICK_NS, TICK_NS // 3, 3 * TICK_NS))
         now_ns += passed_ns
-        for each in twin.heard:
-            each.awake_ns += min(passed_ns, NS_PER_S // 4)
+        twin.listen(passed_ns)
         agent.obstacles.tick(now_ns)
         for id in ("r1", "r2"):
             if chance.random() < 0.4:
@@ -236,8 +229,7 @@ def drive(seed: int, ticks: int = 60) -> Driven:
                     lease_s=chance.choice((0.1, 0.5, 2.0)),
                 )
                 agent.obstacles.take_report(report, now_ns)
-                twin.heard = [each for each in twin.heard if each.report.id != id]
-                twin.heard.append(Heard(report, now_ns))
+                twin.hear(report)
         closed = twin.must()
         seq += 1
         grants = {}

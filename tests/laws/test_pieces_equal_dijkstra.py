@@ -8,19 +8,17 @@ import numpy as np
 import pytest
 from support import slow_twins as naive
 from support.effort import few
-from support.kernel_oracle import loaded, unpadded
+from support.kernel_oracle import grown, loaded, unpadded
 from support.planner_play import Play
-from support.planner_strategies import RULES, random_pace
+from support.planner_strategies import RULES, cell_near, change, inside, open_cell, random_pace, random_window
 
 from planner_service import growth_times
 from planner_service.kernels.layout import NONE
 from planner_service.kernels.tile_pieces import SIDE
 from planner_service.tree import partitioned_tree as pieces
-from planner_service.tree.cost_grid import CostGrid
-from planner_service.tree.cost_to_go import CostToGoTree
 from planner_service.tree.partitioned_tree import PartitionedTree
 from swarm.config.scenario import PlannerConfig, Strategy
-from swarm.grid import GridSpec, Window
+from swarm.grid import Window
 from swarm.wire.route_columns import OK, RouteBatch
 
 FINE = 1e-11
@@ -28,36 +26,36 @@ FINE = 1e-11
 
 
 class Chase:
-    """A map, a target that moves on it, and its tree."""
+    """A map, a target that moves on it, and its tree.
 
-    def __init__(self, seed: int, most: int) -> None:
+    most   rows and columns of a random map, fewer than that
+    shape  rows and columns of a map that costs little
+    """
+
+    def __init__(self, seed: int, most: int = 0, shape: tuple[int, int] | None = None) -> None:
         self.rng = rng = np.random.default_rng(seed)
-        rows, cols = (int(side) for side in rng.integers(max(most // 8, 1), most, 2))
         self.rules = RULES[seed % 5]
         ratio, walls = (1.0, 30.0, 1000.0, 1e12)[seed // 5 % 4], (0.0, 0.1, 0.25, 0.4)[seed // 3 % 4]
-        self.pace = random_pace(rng, rows, cols, ratio, walls)
-        if seed % 4 == 3:
+        if shape is None:
+            self.pace = random_pace(rng, *rng.integers(max(most // 8, 1), most, 2), ratio, walls)
+        else:
+            self.pace = random_pace(rng, *shape, 4.0, 0.1)
+        if shape is None and seed % 4 == 3:
             self.pace[:] = np.where(np.isfinite(self.pace), np.float32(1.1), np.inf)  # many ways cost the same
         self.ground = loaded(self.pace, **self.rules)
-        self.cells = self.ground.pad_all(np.arange(rows * cols))
+        self.cells = self.ground.pad_all(np.arange(self.pace.size))
         with mock.patch.object(pieces, "MOST_KEPT", (1, 2, 5, 1024)[seed // 2 % 4]):
             self.tree = PartitionedTree(self.ground)  # what it says must not hang on what it has kept
         self.gave_way = 0
-        self.grow(int(rng.choice(np.flatnonzero(np.isfinite(self.pace)))))
+        self.grow(open_cell(rng, self.pace))
 
     def grow(self, root: int) -> None:
-        grown = CostToGoTree(self.ground)
-        grown.grow(root)
-        self.tree.take(root, grown.parent)
+        self.tree.take(root, grown(self.ground, root).parent)
 
     def go(self, far: int) -> None:
-        rows, cols = self.pace.shape
-        row, col = divmod(self.tree.root, cols)
-        row = int(np.clip(row + self.rng.integers(-far, far + 1), 0, rows - 1))
-        col = int(np.clip(col + self.rng.integers(-far, far + 1), 0, cols - 1))
-        if not np.isfinite(self.pace[row, col]):
-            row, col = divmod(self.tree.root, cols)
-        root = row * cols + col
+        root = cell_near(self.rng, self.ground.grid, self.tree.root, far)
+        if not np.isfinite(self.pace.flat[root]):
+            root = self.tree.root
         window = self.ground.grid.around(root, 2 * far + int(self.rng.integers(1, 24)))
         connected = self.tree.move(root, window)
         if connected and self.rng.random() < 0.2:
@@ -76,39 +74,28 @@ class Chase:
                 return
 
     def mark(self) -> None:
-        rows, cols = self.pace.shape
         windows = []
         for _ in range(int(self.rng.integers(1, 4))):
-            row, col, side = (
-                int(self.rng.integers(rows)),
-                int(self.rng.integers(cols)),
-                int(self.rng.integers(1, 9)),
-            )
-            window = Window(row, col, min(row + side, rows), min(col + side, cols))
-            patch = self.pace[window.row0 : window.row1, window.col0 : window.col1]
+            side = int(self.rng.integers(1, 9))
+            windows.append(random_window(self.rng, self.pace, side, side))
             factor = float(self.rng.choice([0.0, 0.3, 0.7, 3.0, np.inf]))
-            patch[:] = patch * np.float32(factor) if factor else random_pace(self.rng, *patch.shape, 5.0, 0.3)
-            windows.append(window)
+            change(self.rng, inside(self.pace, windows[-1]), factor)
         self.settle(windows)
 
     def strike(self) -> None:
         """Changes dots, lines and patches all over the map: more expensive, cheaper, closed, opened or all of
         these."""
-        rows, cols = self.pace.shape
         kind, windows = int(self.rng.integers(5)), [self.ground.grid.around(self.tree.root, 0)]
-        other = random_pace(self.rng, rows, cols, 5.0, 0.2)
         for _ in range(int(self.rng.choice([3, 10, 30]))):
-            row, col, long = (int(self.rng.integers(most)) for most in (rows, cols, 90))
-            high, wide = ((1, 1), (1, long), (long, 1), (6, 6))[int(self.rng.integers(4))]
-            window = Window(row, col, min(row + high, rows), min(col + wide, cols))
-            patch = self.pace[window.row0 : window.row1, window.col0 : window.col1]
+            long = int(self.rng.integers(1, 90))
+            size = ((1, 1), (1, long), (long, 1), (6, 6))[int(self.rng.integers(4))]
+            windows.append(random_window(self.rng, self.pace, *size))
             factor = (np.inf, 1.5, 0.5, 0.0, float(self.rng.choice([np.inf, 30.0, 0.1, 0.0])))[kind]
-            fresh = other[window.row0 : window.row1, window.col0 : window.col1]
-            patch[:] = patch * np.float32(factor) if factor else fresh
-            windows.append(window)
+            change(self.rng, inside(self.pace, windows[-1]), factor)
         self.settle(windows)
 
     def settle(self, windows: list[Window]) -> None:
+        """Repairs the tree or, where it gives way, grows it. The root stays passable."""
         if not np.isfinite(self.pace.flat[self.tree.root]):
             self.pace.flat[self.tree.root] = 1.0
         self.tree.repair(self.ground.apply(self.pace, windows))
@@ -151,13 +138,15 @@ def chases(seeds: range, most: int, happenings: int) -> int:
     return gave_way
 
 
-def test_random_chases() -> None:
-    assert chases(range(few(10)), 140, 6) < 20
-
-
-@pytest.mark.thorough
-def test_many_random_chases() -> None:
-    assert chases(range(1000, 1300), 260, 12) < 1200
+@pytest.mark.parametrize(
+    ("seeds", "most", "happenings", "gives_way"),
+    [
+        (range(few(10)), 140, 6, 20),
+        pytest.param(range(1000, 1300), 260, 12, 1200, marks=pytest.mark.thorough),
+    ],
+)
+def test_random_chases(seeds: range, most: int, happenings: int, gives_way: int) -> None:
+    assert chases(seeds, most, happenings) < gives_way
 
 
 @pytest.mark.parametrize(("strategy", "has_worker"), [("exact", False), ("exact", True), ("auto", False)])
@@ -195,20 +184,17 @@ def test_single_cells_beside_the_borders_of_tiles(seed: int) -> None:
         along = int(chase.rng.integers(1 + (rows if n % 2 else cols) // SIDE)) * SIDE - int(chase.rng.integers(2))
         cell = (along, int(chase.rng.integers(cols))) if n % 2 else (int(chase.rng.integers(rows)), along)
         row, col = min(max(cell[0], 0), rows - 1), min(max(cell[1], 0), cols - 1)
-        if row * cols + col == chase.tree.root:
-            continue
-        chase.pace[row, col] = chase.rng.choice([1.0, 0.02, 50.0, np.inf, 5.0])
-        chase.tree.repair(chase.ground.apply(chase.pace, [Window(row, col, row + 1, col + 1)]))
-        if not chase.tree.exact:
-            chase.grow(chase.tree.root)
-        chase.check()
+        if row * cols + col != chase.tree.root:
+            chase.pace[row, col] = chase.rng.choice([1.0, 0.02, 50.0, np.inf, 5.0])
+            chase.settle([Window(row, col, row + 1, col + 1)])
+            chase.check()
 
 
-def struck(seeds: range, most: int) -> int:
-    """Like `chases`, but the tree may look at few tiles at a time or at any number."""
-    gave_way = 0
-    for seed in seeds:
-        chase = Chase(seed, most)
+def test_marks_of_every_kind_and_size() -> None:
+    """Ways are lost and found, pieces rise and fall. The tree may look at few tiles at a time or at any number."""
+    seeds, gave_way = few(53), 0
+    for seed in range(20000, 20000 + seeds):
+        chase = Chase(seed, 330)
         chase.tree._most = (8.0, 1e9, 1e9)[seed % 3]
         for _ in range(8):
             chase.strike()
@@ -216,22 +202,15 @@ def struck(seeds: range, most: int) -> int:
                 chase.go(1)
             chase.check()
         gave_way += chase.gave_way
-    return gave_way
-
-
-def test_marks_of_every_kind_and_size() -> None:
-    """Ways are lost and found, pieces rise and fall."""
-    seeds = few(53)
-    assert struck(range(20000, 20000 + seeds), 330) < 4 * seeds
+    assert gave_way < 4 * seeds
 
 
 def test_what_loses_its_way_and_has_it_again_is_looked_at_along_its_edge_only() -> None:
     """All costs behind a closed way rise by one number, and so the parents stay."""
     rows, cols = 640, 640
-    ground = CostGrid(GridSpec(rows, cols, 1.0), PlannerConfig())
     pace = random_pace(np.random.default_rng(8), rows, cols, 3.0, 0.1)
+    ground = loaded(pace)
     root = int(np.flatnonzero(np.isfinite(pace))[0])
-    ground.load(pace)
     tree = PartitionedTree(ground)
     tree.grow(root)
     looked = mended = 0
@@ -252,14 +231,7 @@ def test_ways_closed_all_over_the_map(seed: int) -> None:
     """Long branches lose their ways at many places at once, and find others from tile to tile, in turn. Tiles at
     the edge are two cells wide: all of such a one may lose its way."""
     rows, cols = 258, 322
-    rng = np.random.default_rng(seed)
-    chase = Chase(4 * seed + 1, 30)
-    chase.pace = random_pace(rng, rows, cols, 4.0, 0.1)
-    chase.ground = loaded(chase.pace, **chase.rules)
-    chase.cells = chase.ground.pad_all(np.arange(chase.pace.size))
-    chase.tree = PartitionedTree(chase.ground)
-    chase.grow(int(rng.choice(np.flatnonzero(np.isfinite(chase.pace)))))
-    root = divmod(chase.tree.root, cols)
+    chase, rng = Chase(4 * seed + 1, shape=(rows, cols)), np.random.default_rng(seed)
     for factor in (np.inf, np.inf, 5.0):
         windows = []
         for n in range(16):
@@ -268,11 +240,8 @@ def test_ways_closed_all_over_the_map(seed: int) -> None:
                 row, col, long = int(rng.integers(190)), cols - 3, 70
             high, wide = (1, long) if n % 4 and rng.random() < 0.5 else (long, 1)
             window = Window(row, col, min(row + high, rows), min(col + wide, cols))
-            if window.row0 <= root[0] < window.row1 and window.col0 <= root[1] < window.col1:
-                continue
-            chase.pace[window.row0 : window.row1, window.col0 : window.col1] *= np.float32(factor)
-            windows.append(window)
-        chase.tree.repair(chase.ground.apply(chase.pace, windows))
-        if not chase.tree.exact:
-            chase.grow(chase.tree.root)
+            if not window.contains(*divmod(chase.tree.root, cols)):
+                change(rng, inside(chase.pace, window), factor)
+                windows.append(window)
+        chase.settle(windows)
         chase.check()

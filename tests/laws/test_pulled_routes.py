@@ -150,49 +150,57 @@ def encode_again(batch: RouteBatch) -> list[Route]:
     return columns.listed
 
 
+class Drive:
+    """A vehicle that sets out on a pulled route over random ground. It has one unless `cells` is empty."""
+
+    def __init__(self, seed: int, lethal: float, resolution_m: float = 1.0) -> None:
+        self.random = np.random.default_rng(seed)
+        self.pace = random_ground(self.random, 24, 24, lethal)
+        self.finder = RouteFinder(self.pace, (0, 0), resolution_m=resolution_m)
+        self.start = int(self.random.choice(np.flatnonzero(np.isfinite(self.pace))))
+        found = self.finder._tree.routes([self.start])
+        self.route = Puller(self.pace, resolution_m, PlannerConfig()).pull_batch(found)[0]
+        self.cells: list[int] = []
+        self.follower, self.motion = Follower(), Motion(self.finder.grid, self.start)
+        if self.route.status is RouteStatus.OK and self.route.directions:
+            self.cells = walk(self.finder.grid, self.start, self.route.directions)
+            assert self.follower.begin(self.cells, self.cells[:1], turns=self.route.turns)
+
+    def point(self, cell: int) -> tuple[float, float] | None:
+        return self.follower.point(cell, 24)
+
+
+SEEDS, LETHAL = st.integers(0, 2**32 - 1), st.sampled_from((0.0, 0.2))
+
+
 @settings(max_examples=60)
-@given(st.integers(0, 2**32 - 1), st.sampled_from((0.0, 0.2)))
+@given(SEEDS, LETHAL)
 def test_who_drives_a_pulled_route_takes_its_integral_and_is_in_its_cells_all_the_way(
     seed: int, lethal: float
 ) -> None:
-    random = np.random.default_rng(seed)
-    pace = random_ground(random, 24, 24, lethal)
-    finder = RouteFinder(pace, (0, 0))
-    route = finder.route(*divmod(int(random.choice(np.flatnonzero(np.isfinite(pace)))), 24))
-    if route.status is not RouteStatus.OK or len(route.cells) < 2:
-        return
-    batch = finder._tree.routes([finder.grid.cell(*route.cells[0].tolist())])
-    given_route = Puller(pace, 1.0, PlannerConfig()).pull_batch(batch)[0]
-    cells = walk(finder.grid, given_route.start, given_route.directions)
-    follower, motion = Follower(), Motion(finder.grid, cells[0])
-    assert follower.begin(cells, cells[:1], turns=given_route.turns)
-    took_s = 0.0
-    for cell in cells[1:]:
-        motion.set_out(cell, follower.point(cell, 24))
+    drive = Drive(seed, lethal)
+    motion, took_s = drive.motion, 0.0
+    for cell in drive.cells[1:]:
+        motion.set_out(cell, drive.point(cell))
         while not motion.at_rest:
-            occupied, tick_s = motion.cell, float(random.uniform(0.05, 1.0))
-            took_s += tick_s - motion.advance(tick_s, float(pace.item(occupied)))
+            occupied, tick_s = motion.cell, float(drive.random.uniform(0.05, 1.0))
+            took_s += tick_s - motion.advance(tick_s, float(drive.pace.item(occupied)))
             east, south = motion.place_m()
             row, col = divmod(motion.cell, 24)
             assert max(abs(south - row - 0.5), abs(east - col - 0.5)) <= 0.5 + 1e-9
-        follower.moved(cell)
-    assert took_s == pytest.approx(finder.pull(route).cost_s, rel=1e-9)
+        drive.follower.moved(cell)
+    if drive.cells:
+        route = drive.finder.route(*divmod(drive.start, 24))
+        assert took_s == pytest.approx(drive.finder.pull(route).cost_s, rel=1e-9)
 
 
 @settings(max_examples=30)
-@given(st.integers(0, 2**32 - 1), st.sampled_from((0.0, 0.2)))
+@given(SEEDS, LETHAL)
 def test_dynamics_know_how_long_a_pulled_route_is_and_where_it_turns(seed: int, lethal: float) -> None:
     """On cells that a segment crosses there is no turn, and no more way than the segment is long."""
-    random = np.random.default_rng(seed)
-    pace = random_ground(random, 24, 24, lethal)
-    finder = RouteFinder(pace, (0, 0), resolution_m=5.0)
-    start = int(random.choice(np.flatnonzero(np.isfinite(pace))))
-    pulled = Puller(pace, 5.0, PlannerConfig()).pull_batch(finder._tree.routes([start]))[0]
-    if pulled.status is not RouteStatus.OK or not 1 < len(pulled.directions) <= 20:  # what a vehicle looks ahead
+    drive = Drive(seed, lethal, resolution_m=5.0)
+    if not 1 < len(drive.route.directions) <= 20:  # what a vehicle looks ahead
         return
-    cells = walk(finder.grid, start, pulled.directions)
-    follower, motion = Follower(), Motion(finder.grid, start)
-    assert follower.begin(cells, cells[:1], turns=pulled.turns)
     asked: list[Stretch] = []
 
     class Says:
@@ -200,12 +208,12 @@ def test_dynamics_know_how_long_a_pulled_route_is_and_where_it_turns(seed: int, 
             asked.append(stretch)
             return 1.0
 
-    dynamics = PluginDynamics(Says(), finder.grid, None)
-    motion.set_out(cells[1], follower.point(cells[1], 24))
+    dynamics, cells = PluginDynamics(Says(), drive.finder.grid, None), drive.cells
+    drive.motion.set_out(cells[1], drive.point(cells[1]))
     dynamics.begin(0.1)
-    dynamics.advance("v", motion, cells, 0.1, 0.1, lambda cell: follower.point(cell, 24))
-    assert asked[0].ahead_m == pytest.approx(pulled.length_m, rel=1e-12)
-    corners = [np.divmod(np.array(cells)[turn], 24) for turn in pulled.turns]
+    dynamics.advance("v", drive.motion, cells, 0.1, 0.1, drive.point)
+    assert asked[0].ahead_m == pytest.approx(drive.route.length_m, rel=1e-12)
+    corners = [np.divmod(np.array(cells)[turn], 24) for turn in drive.route.turns]
     assert len(asked[0].turns) == len(corners) - 2
     legs_m = [5.0 * math.dist(a, b) for a, b in itertools.pairwise(corners)]
     assert [at_m for at_m, _ in asked[0].turns] == pytest.approx(list(itertools.accumulate(legs_m))[:-1])

@@ -8,12 +8,11 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from support.effort import few
-from support.kernel_oracle import inner, loaded
+from support.kernel_oracle import grown, inner, loaded
 
 from planner_service.search_belief import Belief, blocks_of
 from planner_service.target_search import IDLE_S, Searcher, Ways
 from planner_service.tree.cost_grid import CostGrid
-from planner_service.tree.cost_to_go import CostToGoTree
 from shared_map.terrain.slope_and_climb import Climb, climb_of
 from swarm.config.ground import CostConfig
 from swarm.grid import GridSpec, Window, walk
@@ -209,9 +208,7 @@ def test_a_target_is_never_taken_to_be_where_it_is_not_because_it_came_there_by_
     pace[:, :: max(cols // 3, 1)] = 0.02  # roads
     costs, chance = costs_of(pace), np.random.default_rng(seed)
     start, goal = (int(each) for each in chance.choice(np.flatnonzero(np.isfinite(pace)), 2))
-    tree = CostToGoTree(costs)
-    tree.grow(goal)
-    ways = Ways(costs)
+    tree, ways = grown(costs, goal), Ways(costs)
     ways.grow(goal)
     if goal == start or np.isinf(ways.costs_s.flat[start]):
         return

@@ -11,13 +11,12 @@ from numpy.typing import NDArray
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import connected_components
 from support import slow_twins as naive
-from support.kernel_oracle import inner, loaded, unpadded
-from support.planner_strategies import RULES, random_pace
+from support.kernel_oracle import grown, inner, loaded, unpadded
+from support.planner_strategies import RULES, open_cell, random_pace
 
 from planner_service.kernels import stride_networks
 from planner_service.kernels.stride_networks import StrideNetwork
 from planner_service.tree import cost_to_go, strides
-from planner_service.tree.cost_to_go import CostToGoTree
 from planner_service.tree.strides import find_strides
 from swarm.grid import STEP_COL, STEP_ROW
 
@@ -47,14 +46,18 @@ class Ground:
         self.rng, self.pace, self.rules = rng, pace, rules
         self.costs = loaded(pace, **rules)
         self.network = find_strides(self.costs)
-        self.steps = naive.steps(pace, **rules)
+        self.steps = [
+            step
+            for _, here, there in naive.legal_steps(pace, rules["neighbours"], rules["corner_cutting"])
+            for step in zip(here.tolist(), there.tolist(), strict=True)
+        ]
 
     def labels(self, side: int) -> Labels:
         """(cells,): which component of its block of `side` x `side` cells each cell belongs to; -1 for none."""
         rows, cols = self.pace.shape
         row, col = np.divmod(np.arange(rows * cols), cols)
         block = row // side * cols + col // side
-        inside = [(u, v) for u, v, _ in self.steps if block[u] == block[v]]
+        inside = [(u, v) for u, v in self.steps if block[u] == block[v]]
         label = _components(rows * cols, inside)
         label[~np.isfinite(self.pace.reshape(-1))] = -1
         return label
@@ -98,7 +101,7 @@ def test_nodes_are_the_components_of_blocks_linked_wherever_a_step_leads(seed: i
         nodes = np.flatnonzero(doublings == level)
         assert sorted(label[cells[nodes]]) == sorted(set(label[label >= 0]))
         found = {(label[cells[a]], label[cells[b]]) for a, b, _ in links if doublings[a] == doublings[b] == level}
-        assert found == {(label[u], label[v]) for u, v, _ in ground.steps if label[u] != label[v]}
+        assert found == {(label[u], label[v]) for u, v in ground.steps if label[u] != label[v]}
         # The members of one node at this stride share one at the next, and a link leads there.
         above = {(a, label[cells[b]]) for a, b, _ in links if doublings[a] == level - 1 and doublings[b] == level}
         assert above == {(a, label[cells[a]]) for a in np.flatnonzero(doublings == level - 1)}
@@ -108,7 +111,7 @@ def test_nodes_are_the_components_of_blocks_linked_wherever_a_step_leads(seed: i
 @settings(max_examples=10, deadline=None)
 def test_a_links_way_is_of_legal_steps_inside_its_two_nodes(seed: int, rules: dict) -> None:
     ground = Ground(seed, rules)
-    legal = {(u, v) for u, v, _ in ground.steps}
+    legal = set(ground.steps)
     cells = unpadded(ground.costs, ground.network[0].astype(np.int64))
     doublings = ground.network[1].astype(int)
     labels = {level: ground.labels(1 << level) for level in set(doublings)}
@@ -127,9 +130,8 @@ def test_every_node_that_its_distance_asks_for_is_reached(seed: int, rules: dict
     """For each cell with a way: the node that holds it, of the stride for its distance from the target."""
     ground = Ground(seed, rules)
     rows, cols = ground.pace.shape
-    root = int(ground.rng.choice(np.flatnonzero(np.isfinite(ground.pace))))
-    tree = CostToGoTree(ground.costs)
-    tree.grow(root)
+    root = open_cell(ground.rng, ground.pace)
+    tree = grown(ground.costs, root)
     half = int(ground.rng.integers(2, 6))
     kept = []
     make = stride_networks.make_scratch
@@ -173,8 +175,7 @@ def test_every_node_that_its_distance_asks_for_is_reached(seed: int, rules: dict
 def test_along_strides_no_route_gets_costlier_whatever_was_marked_since(seed: int, rules: dict) -> None:
     ground = Ground(seed, rules)
     grid, costs = ground.costs.grid, ground.costs
-    tree = CostToGoTree(costs)
-    tree.grow(int(ground.rng.choice(np.flatnonzero(np.isfinite(ground.pace)))))
+    tree = grown(costs, open_cell(ground.rng, ground.pace))
     for turn in range(6):
         if turn % 2:
             row, col = int(ground.rng.integers(grid.rows)), int(ground.rng.integers(grid.cols))

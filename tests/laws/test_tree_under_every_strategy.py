@@ -1,6 +1,9 @@
 """The laws of the tree under everything that happens to it, for every strategy, and where a growth is left to a
-worker: until it is adopted, answers are of the older tree, keep every law and say where they lead."""
+worker: until it is adopted, answers are of the older tree, keep every law and say where they lead. While only the
+kernels of a first route are compiled, a tree keeps every law, and calls no other."""
 
+import sys
+from collections.abc import Callable
 from dataclasses import replace
 from unittest import mock
 
@@ -26,6 +29,7 @@ from support.planner_swarm import GRID, Swarm, flat
 
 from planner_service import growth_times
 from planner_service.growth_times import WindowSchedule, block_half
+from planner_service.kernel_build import FIRST, LATER
 from planner_service.strategy import STAGES
 from shared_map.terrain.slope_and_climb import ENTRIES, Climb, climb_of
 from swarm.config.ground import CostConfig
@@ -68,16 +72,6 @@ def test_a_long_walk_with_marks_keeps_the_laws(strategy: str, directed: bool) ->
     assert strategy in ("full", "exact") or kinds & {"window", "coarse"}, kinds
 
 
-@pytest.mark.parametrize("jump", [5, 8, 16, 30])
-@pytest.mark.parametrize("strategy", STRATEGIES)
-def test_after_a_jump_every_route_arrives(strategy: str, jump: int) -> None:
-    pace = random_pace(np.random.default_rng(jump), 48, 48, 5.0, 0.2)
-    play = Play(pace, PlannerConfig(strategy=strategy, k_min=0, cpu_budget=1e-9))  # type: ignore[arg-type]
-    for rows, cols in ((jump, 0), (0, jump), (-jump, -jump), (47, 47)):
-        play.happen(Move(rows, cols))
-        play.check()
-
-
 def one_way() -> Climb:
     """A terrace: from column 20 on the ground lies 1 m lower, which may be driven down and not up."""
     heights = np.zeros((30, 40), np.float32)
@@ -101,21 +95,6 @@ def test_who_has_a_way_only_to_where_the_target_is_now_gets_one(strategy: str) -
         play.check()
     assert strategy in ("full", "exact") or "full" in kinds[1:], kinds
     assert strategy in ("full", "exact") or {"window", "coarse"} & {*kinds}, kinds
-
-
-def printed_half(grid: GridSpec, old: int, new: int) -> int:
-    """The paper's rule as it is printed: a block must be crossed in row and column at once."""
-    (row, col), (old_row, old_col) = grid.row_col(new), grid.row_col(old)
-    crossed = [k for k in range(1, 10) if row >> k != old_row >> k and col >> k != old_col >> k]
-    return 2 << max(crossed) if crossed else 1 << 1
-
-
-def test_the_printed_rule_never_widens_for_a_move_along_an_axis() -> None:
-    grid = GridSpec(512, 512, 1.0)
-    old, new = grid.cell(256, 255), grid.cell(256, 256)
-    assert printed_half(grid, old, new) == 2
-    assert block_half(grid, old, new, 1) == 512
-    assert printed_half(grid, grid.cell(255, 255), new) == 512
 
 
 def test_the_windows_of_variable_range_are_as_wide_as_in_the_papers_figure_3() -> None:
@@ -243,7 +222,6 @@ def test_after_a_jump_the_older_tree_leads_where_it_led_and_follows_the_map() ->
 
 def test_a_query_waits_for_the_first_tree_but_not_for_long(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(growth_times, "INLINE_NS", 100)
-    swarm = Swarm(flat())
     for growth_s, expected in ((0.4, RouteStatus.OK), (30.0, RouteStatus.NO_TARGET)):
         monkeypatch.setattr(growth_times, "MODEL_NS_PER_CELL", int(growth_s * 1e9 / GRID.cells))
         swarm = Swarm(flat())
@@ -274,3 +252,73 @@ def test_while_a_worker_grows_after_a_jump_routes_say_where_they_lead_and_how_ol
     swarm.run(1.0)
     reply = swarm.ear.routes(0)
     assert (reply.target_cell, reply.routes[0].status) == (second, RouteStatus.OK)
+
+
+# --- while only the kernels of a first route are compiled ----------------------------------------
+
+
+class Guard:
+    """Stands for a kernel that is not compiled until `open`."""
+
+    opened = False
+
+    def __init__(self, kernel: Callable[..., object]) -> None:
+        self.kernel = kernel
+
+    def __call__(self, *arguments: object) -> object:
+        assert Guard.opened, f"{self.kernel} is called before it is compiled"
+        return self.kernel(*arguments)
+
+
+@pytest.fixture
+def guarded(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Guards every name in the planner by which one of the later kernels is called."""
+    guards = {id(kernel): Guard(kernel) for kernel in LATER}
+    found = set()
+    for name, module in list(sys.modules.items()):
+        if name.startswith("planner_service") and name != "planner_service.kernel_build":
+            for key, value in list(vars(module).items()):
+                if id(value) in guards:
+                    monkeypatch.setattr(module, key, guards[id(value)])
+                    found.add(id(value))
+    assert found == set(guards)
+    Guard.opened = False
+
+
+@pytest.mark.usefixtures("guarded")
+@given(paces(), planner_configs(), happenings(), st.integers(0, 10))
+@settings(max_examples=few(150), deadline=None)
+def test_whatever_happens_before_and_after_the_last_kernel_is_there_keeps_the_laws(
+    pace: np.ndarray, config: PlannerConfig, events: list[Move | Marks | Job], opens: int
+) -> None:
+    Guard.opened = False
+    play = Play(pace, config, lambda: Guard.opened)
+    play.check()
+    for n, event in enumerate(events):
+        Guard.opened |= n == opens
+        play.happen(event)
+        play.check()
+
+
+@pytest.mark.usefixtures("guarded")
+@pytest.mark.parametrize("strategy", STRATEGIES)
+def test_every_strategy_begins_with_whole_trees_and_goes_on_as_it_would(strategy: str) -> None:
+    pace = random_pace(np.random.default_rng(2), 40, 40, 5.0, 0.1)
+    config = PlannerConfig(strategy=strategy, k_min=0, cpu_budget=1e-9)  # type: ignore[arg-type]
+    play = Play(pace, config, lambda: Guard.opened)
+    for event in (Move(1, 1), Job("begin"), Marks(3, 3), Move(1, 0), Job("end"), Job("force"), Move(0, 1)):
+        play.happen(event)
+        play.check()
+        assert play.last.kind in ("full", "bounded", "none")
+        assert play.tree.routes(np.arange(play.grid.cells)).gaps.max(initial=1.0) < 1.0001
+    Guard.opened = True
+    kinds = set()
+    for _ in range(8):
+        play.happen(Move(1, 0))
+        play.check()
+        kinds.add(play.last.kind)
+    assert (kinds <= {"full", "bounded", "none"}) == (strategy == "full")
+
+
+def test_no_kernel_is_in_both_lists() -> None:
+    assert not {id(kernel) for kernel in FIRST} & {id(kernel) for kernel in LATER}

@@ -12,13 +12,12 @@ from hypothesis import strategies as st
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import dijkstra
 from support.effort import few
-from support.kernel_oracle import inner, loaded
+from support.kernel_oracle import grown, inner, loaded
 from support.segments import crossed
 
 from planner_service.any_angle_routes import Puller
 from planner_service.route_finder import RouteFinder
 from planner_service.target_search import Ways
-from planner_service.tree.cost_to_go import CostToGoTree
 from shared_map.terrain.slope_and_climb import STILL, Wind, wind_of
 from shared_map.vehicle_class_grounds import AirGround, air_ground
 from swarm.config.scenario import PlannerConfig
@@ -132,8 +131,7 @@ def test_trees_and_ways_back_in_wind_are_scipys_over_the_wind_triangle(
     flown = flown_over(ground, wind)
     edges = twin_edges(flown, wind)
     costs = loaded(flown.pace_s_per_m, flown.climb.grid, flown.climb)
-    tree = CostToGoTree(costs)
-    tree.grow(0)
+    tree = grown(costs, 0)
     to_target = dijkstra(edges.T, indices=0)
     np.testing.assert_allclose(inner(tree, tree.cost).reshape(-1), to_target, rtol=ROUNDED)
     ways = Ways(costs)

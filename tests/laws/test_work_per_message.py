@@ -9,6 +9,8 @@ from typing import Any
 
 import numpy as np
 import pytest
+from laws.test_no_message_harms import AUTHORS, NAMED, PACE, Lied
+from support.bus_world import Box
 from support.effort import few
 from support.message_fuzzer import NAMES, MessageFuzzer
 
@@ -18,7 +20,6 @@ from swarm.peers import Peer
 from swarm.wire.codec import encode
 from swarm.wire.route_columns import RouteStatus
 from swarm.wire.topics import TOPICS, Topic, check_size
-from tests.laws.test_no_message_harms import AUTHORS, NAMED, PACE, Lied, ignore
 
 REPEATS = 3
 NAMES_SENT = tuple(dict.fromkeys((*NAMES, *NAMED, *AUTHORS)))
@@ -85,7 +86,7 @@ def test_the_longest_message_of_each_topic_costs_no_service_much(topic: Topic, s
             assert swarm.cost_ms(put) < MOST_MS, type(message)
         if topic.request is not None:
             request = fuzzer.large(topic.request, topic.ask_bytes)
-            ask = partial(sender.ask, topic, request, ignore, tag="q")
+            ask = partial(sender.ask, topic, request, Box(), tag="q")
             assert swarm.cost_ms(ask) < MOST_MS, type(request)
     sender.close()
 

@@ -20,14 +20,11 @@ import msgspec
 import pytest
 import zenoh
 from support.bus_behaviour import *  # noqa: F403
-from support.bus_behaviour import MARKS, TRUE_POSE
+from support.bus_behaviour import MARKS, OURS, TRUE_POSE, stored, table
 from support.bus_world import Box, answering, asked, decoded, heard_by, marks, pose
 from support.dummy_roles import Idle
 from support.makers import cost_reply, run_info
 from support.processes import eventually
-from support.query_behaviour import *  # noqa: F403
-from support.trusted_behaviour import *  # noqa: F403
-from support.trusted_behaviour import OURS, stored, table
 from support.zenoh_router import Router
 
 from docs.generate.wire_page import JSON_PATH as WIRE_PAGE

@@ -1,20 +1,27 @@
 """The rules of `swarm.bus.bus.Bus` as tests: `tests/unit/swarm/test_memory_bus` runs them on the simulated network,
-`tests/live/test_zenoh_bus` on real sessions. A rule that held on one only would make simulations misleading."""
+`tests/live/test_zenoh_bus` on real sessions. A rule that held on one only would make simulations misleading.
+
+For codes of messages the `bus` of a world takes an `authenticator`.
+"""
 
 from __future__ import annotations
 
+from typing import Any
+
 import pytest
 from support.bus_world import Box, World, answering, asked, decoded, heard_by, marks, note, pose, waiting
-from support.makers import run_info
+from support.makers import cost_reply, run_info
 
 from shared_map.replication.marks import packed
-from swarm.bus.bus import Appeared, AskEnded, Disappeared, Heard, LinkChanged, Replied, meant_for
+from swarm.bus.bus import Appeared, Asked, AskEnded, Disappeared, Event, Heard, LinkChanged, Replied, meant_for
 from swarm.peers import Peer
+from swarm.wire.access import Authenticator
 from swarm.wire.codec import encode
 from swarm.wire.messages import Nothing
 from swarm.wire.messages.map_data import MarksRequest
-from swarm.wire.messages.traffic import Stored
-from swarm.wire.topics import MARKS, NOTE, RUN, STORED, TRUE_POSE
+from swarm.wire.messages.planning import CostRequest
+from swarm.wire.messages.traffic import Claim, Stored, Table
+from swarm.wire.topics import COST, MARKS, NOTE, RUN, STORED, TABLE, TRUE_POSE, rank_of
 
 # --- publish and subscribe ----------------------------------------------------------------------------------
 
@@ -298,6 +305,131 @@ def test_a_cut_link_is_told_and_what_was_declared_works_again_when_it_heals(worl
     assert len(asked(world, b, RUN, Nothing()).of(Replied)) == 1
 
 
+# --- questions ---------------------------------------------------------------------------------------------
+
+
+def test_a_query_is_answered_once(world: World):
+    a, b = world.bus("a"), world.bus("b")
+    b.serve(RUN, answering((run_info(id="b"), {})), role="agent", id="b")
+    world.settle()
+    assert asked(world, a, RUN, Nothing(), role="agent", id="b") == [
+        Replied("q", RUN, {"role": "agent", "id": "b"}, run_info(id="b")),
+        AskEnded("q", RUN, 1, None),
+    ]
+    question, answer = (len(meant_for("run/agent/b", encode(each))) for each in (Nothing(), run_info(id="b")))
+    assert (a.counts["bytes_out"], a.counts["bytes_in"]) == (question, answer)
+    assert (b.counts["bytes_out"], b.counts["bytes_in"]) == (answer, question)
+
+
+def test_a_reply_tells_how_long_it_took_from_the_question_to_its_arrival(world: World):
+    _, _, question, box = waiting(world, role="agent", id="b", timeout_s=10.0)
+    waited_s = question.waited_s
+    world.settle()
+    waited_s = question.waited_s - waited_s
+    assert waited_s > 0
+    assert box == []
+    question.answer(run_info(id="b"))
+    question.end()
+    world.until(lambda: box.of(AskEnded))
+    [reply] = box.of(Replied)
+    assert waited_s < reply.took_s < 10.0
+
+
+def test_a_wildcard_query_is_answered_by_everybody_ourselves_included(world: World):
+    buses = {name: world.bus(name) for name in ("a", "b", "c")}
+    for name, bus in buses.items():
+        bus.serve(RUN, answering((run_info(id=name), {})), role="agent", id=name)
+    world.settle()
+    box = asked(world, buses["a"], RUN, Nothing(), role="agent")
+    assert sorted(event.message.id for event in box.of(Replied)) == ["a", "b", "c"]
+    assert box[-1] == AskEnded("q", RUN, 3, None)
+
+
+def test_one_queryable_may_give_many_replies_in_order_and_none_outside_the_asked_key(world: World):
+    a, b = world.bus("a"), world.bus("b")
+    replies = [(marks("x.1", tile), {"region": 0, "tile": tile, "author": "x.1"}) for tile in range(50)]
+    b.serve(MARKS, answering(*replies))
+    world.settle()
+    box = asked(world, a, MARKS, MarksRequest())
+    assert [event.message.tile for event in box.of(Replied)] == list(range(50))
+    assert box[0].fields == {"region": "0", "tile": "0", "author": "x.1"}
+    assert box[-1].replies == 50
+    box = asked(world, a, MARKS, MarksRequest(), tile=3)
+    assert [event.message.tile for event in box.of(Replied)] == [3]
+
+
+def test_the_asked_fields_tell_what_was_asked_and_the_request_arrives(world: World):
+    a, b, seen = world.bus("a"), world.bus("b"), Box()
+
+    def post(event: Event) -> None:
+        seen(event)
+        answering()(event)
+
+    b.serve(MARKS, decoded(post), author="x.1")
+    world.settle()
+    asked(world, a, MARKS, MarksRequest(tiles=[7]), tile=7)
+    assert seen[0].fields == {"region": "*", "tile": "7", "author": "*"}
+    assert seen[0].request == MarksRequest(tiles=[7])
+
+
+def test_a_refusal_reaches_who_asked(world: World):
+    a, b = world.bus("a"), world.bus("b")
+
+    def refuse(event: Any) -> None:
+        event.refuse("not today")
+        event.end()
+
+    b.serve(TABLE, refuse, agent="a0")
+    world.settle()
+    assert asked(world, a, TABLE, Claim(epoch=1), agent="a0") == [AskEnded("q", TABLE, 0, "not today")]
+
+
+def test_a_query_that_is_never_ended_times_out_with_what_came(world: World):
+    a, b, kept = world.bus("a"), world.bus("b"), Box()
+
+    def forget(event: Any) -> None:
+        event.answer(run_info(id="b"))
+        kept(event)
+
+    b.serve(RUN, decoded(forget), role="agent", id="b")
+    world.settle()
+    box = asked(world, a, RUN, Nothing(), timeout_s=0.3)
+    assert [event.message.id for event in box.of(Replied)] == ["b"]
+    assert box[-1] == AskEnded("q", RUN, 1, "timeout")
+
+
+def test_who_serves_learns_how_long_the_asker_waits_and_that_it_has_left(world: World):
+    _, _, question, box = waiting(world, timeout_s=0.7)
+    assert question.timeout_s == 0.7
+    assert not question.expired
+    assert 0 <= question.waited_s < 0.7
+    world.until(lambda: box)
+    world.settle()
+    assert question.expired
+
+
+def test_an_answer_after_the_end_is_a_bug_that_raises(world: World):
+    _, _, question, _ = waiting(world)
+    question.end()
+    question.end()
+    with pytest.raises(RuntimeError, match="after the end"):
+        question.answer(run_info(id="b"))
+
+
+def test_one_that_hears_a_topic_may_serve_it_too(world: World):
+    a, b, heard = world.bus("a"), world.bus("b"), Box()
+    table = Table(shard=0, agent="a0", epoch=1, seq=1, hosts={}, grants={})
+    b.subscribe(TABLE, heard)
+    b.serve(TABLE, answering((table, {"shard": 0, "member": "a1", "agent": "a0"})))
+    world.settle()
+    a.publish(TABLE, table, shard=0, member="a1", agent="a0")
+    world.until(lambda: heard)
+    claim = Claim(epoch=1)
+    assert [
+        event.message for event in asked(world, a, TABLE, claim, shard=0, member="a1", agent="a0").of(Replied)
+    ] == [table]
+
+
 # --- the end ------------------------------------------------------------------------------------------------
 
 
@@ -329,3 +461,93 @@ def test_a_query_to_one_that_closes_ends(world: World):
     world.until(lambda: box)
     assert len(box) == 1
     assert box[0].replies == 0
+
+
+# --- codes of messages -------------------------------------------------------------------------------------
+
+OURS = Authenticator(b"secret", "run")
+OTHERS = (None, Authenticator(b"another secret", "run"), Authenticator(b"secret", "another run"))
+
+
+def table(seq: int = 1) -> Table:
+    return Table(shard=0, agent="a0", epoch=1, seq=seq, hosts={}, grants={})
+
+
+def stored(seq: int = 1) -> Stored:
+    return Stored(shard=0, agent="a0", epoch=1, seq=seq)
+
+
+def test_only_who_knows_the_secret_of_the_run_is_heard(world):
+    ours, hears = world.bus("ours", authenticator=OURS), world.bus("hears", authenticator=OURS)
+    others = [world.bus(f"other{n}", authenticator=each) for n, each in enumerate(OTHERS)]
+    box, anybody = Box(), Box()
+    hears.subscribe(STORED, box, shard=0)
+    others[0].subscribe(STORED, anybody)
+    world.settle()
+    for bus in others:
+        bus.publish(STORED, stored(2), shard=0, member="a1", agent="a0")
+    world.settle()
+    ours.publish(STORED, stored(1), shard=0, member="a1", agent="a0")
+    world.until(lambda: box)
+    assert [event.message.seq for event in box] == [1]
+    assert hears.counts["payloads_dropped"] == 3
+    # A process without the secret may read; it does not hear itself on this topic.
+    world.until(lambda: len(anybody) == 3)
+
+
+def test_of_marks_heard_together_only_those_count_whose_sender_knows_the_secret(world):
+    ours, hears, stranger = world.bus("o", authenticator=OURS), world.bus("h", authenticator=OURS), world.bus("s")
+    box, ticks = Box(), Box()
+    hears.subscribe(MARKS, box)
+    hears.collect(MARKS)
+    for bus, author in ((stranger, "operator.z"), (stranger, "all.r1.1"), (ours, "all.r2.1")):
+        bus.serve(MARKS, answering((marks(author, 0), {"region": 0, "tile": 0})), author=author)
+    world.settle()
+    for bus, author in ((stranger, "operator.z"), (stranger, "all.r1.1"), (ours, "all.r2.1")):
+        bus.publish(MARKS, marks(author, 0), region=0, tile=0, author=author)
+
+    def authors():
+        hears.gather()
+        ticks.extend(hears.collected_together(MARKS))
+        return {message.author for _, message in ticks}
+
+    world.until(lambda: {event.message.author for event in box} == authors() == {"all.r2.1"})
+    replies = asked(world, hears, MARKS, MarksRequest()).of(Replied)
+    assert [each.message.author for each in replies] == ["all.r2.1"]
+    assert len(asked(world, stranger, MARKS, MarksRequest()).of(Replied)) == 3  # reading needs no secret
+
+
+def test_a_question_without_the_secret_is_refused(world):
+    served = Box()
+
+    def post(event):
+        served.append(event)
+        answering((table(), {}))(event)
+
+    world.bus("serves", authenticator=OURS).serve(TABLE, decoded(post), shard=0, member="a1", agent="a0")
+    stranger, ours = world.bus("stranger"), world.bus("ours", authenticator=OURS)
+    world.settle()
+    box = asked(world, stranger, TABLE, Claim(epoch=3), shard=0, member="a1", agent="a0")
+    assert "no process of this run" in box.of(AskEnded)[0].failure
+    assert not box.of(Replied)
+    assert not served
+    box = asked(world, ours, TABLE, Claim(epoch=3), shard=0, member="a1", agent="a0")
+    assert [event.request.epoch for event in served.of(Asked)] == [3]
+    assert len(box.of(Replied)) == 1
+
+
+@pytest.mark.parametrize(("asker", "rank"), [("agent.a0", 0), ("operator.o", 1)])
+def test_an_asker_has_the_turn_of_a_name_only_with_a_code(world, asker: str, rank: int):
+    served = Box()
+
+    def post(event):
+        served.append(event)
+        answering((cost_reply([1.0], target="t0"), {"target": "t0"}))(event)
+
+    world.bus("serves", authenticator=OURS).serve(COST, decoded(post), target="t0")
+    world.settle()
+    for authenticator, expected in ((OURS, rank), (OTHERS[1], 2), (None, 2)):
+        bus = world.bus(f"asks{expected}", authenticator=authenticator)
+        box = asked(world, bus, COST, CostRequest(cells=[1]), target="t0", asker=asker)
+        assert rank_of(served[-1].asker) == expected
+    assert [event.fields["asker"] for event in box.of(Replied)] == [asker]  # a stranger is answered, too

@@ -17,21 +17,33 @@ from swarm.wire.messages.traffic import Granted, Known, KnownRequest, Left
 _ANOTHER_CELL_NS = 2 * NS_PER_S
 
 
-class ExternalProcess(Process):
-    """One generation of a robot. Its body is on `disk`: when the process dies, the body stays there until it is
-    carried away."""
+class Guest(Process):
+    """A process without the core of an agent: no one asks it what it knows."""
 
     world: ExternalWorld
+
+    def make_rights(self) -> RightOfWay:
+        self.begin_as_guest()
+        return RightOfWay(self.agent, self.world.shards, self.world.spawns, OwnRecord(disk=0), {})  # never used
+
+    def begin_as_guest(self) -> None: ...
+
+    def ask_known(self, request: KnownRequest) -> list[Action]:
+        return []
+
+
+class ExternalProcess(Guest):
+    """One generation of a robot. Its body is on `disk`: when the process dies, the body stays there until it is
+    carried away."""
 
     def __init__(self, world: ExternalWorld, agent: str, disk: Disk) -> None:
         super().__init__(world, agent, disk)
         self.hear_token = self.external.host.hear_token
 
-    def make_rights(self) -> RightOfWay:
+    def begin_as_guest(self) -> None:
         self.external = ExternalVehicle(self.world.shards, self.agent, self.disk.own.generations)
         self.asked_ns = 0
         self.leaving = False
-        return RightOfWay(self.agent, self.world.shards, self.world.spawns, OwnRecord(disk=0), {})  # never used
 
     @property
     def settled(self) -> bool:
@@ -40,9 +52,6 @@ class ExternalProcess(Process):
     @property
     def body(self) -> int | None:
         return self.disk.bodies.get(self.external.vehicle)
-
-    def ask_known(self, request: KnownRequest) -> list[Action]:
-        return []
 
     def hear_known(self, known: Known) -> None:
         self.external.host.hear_known(known)
@@ -152,22 +161,17 @@ class AddedProcess(Process):
         super().tick()
 
 
-class OperatorProcess(Process):
+class OperatorProcess(Guest):
     """Declares a robot absent until leaders have freed its cells."""
 
-    world: ExternalWorld
     has_token = False
 
-    def make_rights(self) -> RightOfWay:
+    def begin_as_guest(self) -> None:
         self.removal = Removal(self.world.shards, self.agent)
-        return RightOfWay(self.agent, self.world.shards, self.world.spawns, OwnRecord(disk=0), {})  # never used
 
     @property
     def settled(self) -> bool:
         return self.removal.host.informed
-
-    def ask_known(self, request: KnownRequest) -> list[Action]:
-        return []
 
     def hear_known(self, known: Known) -> None:
         self.removal.hear_known(known)
@@ -234,9 +238,7 @@ class ExternalWorld(TrafficWorld):
             return
         process = alive[0]
         self.gone.add(process.agent)
-        for each in [each for each in self.processes if each.agent == process.agent]:
-            each.alive = False
-            self.processes.remove(each)
+        self.end_all(process.agent)
         self.at(self.external_chance.randrange(NS_PER_S), lambda: self.carry_away(process))
 
     def carry_away(self, process: ExternalProcess, back: bool = True) -> None:
@@ -261,10 +263,8 @@ class ExternalWorld(TrafficWorld):
     def end_robots(self) -> None:
         """All robots die for good. Once no word of theirs is under way any more, they are carried away."""
         self.never_back.update(self.robots)
-        for robot in [each for each in self.processes if isinstance(each, ExternalProcess)]:
-            robot.alive = False
-            self.processes.remove(robot)
         for name in self.robots:
+            self.end_all(name)
             robot = ExternalProcess(self, name, self.disks[name][0])
             self.at(6 * NS_PER_S, partial(self.carry_away, robot, back=False))
 

@@ -38,14 +38,15 @@ def loaded(pace: np.ndarray, grid: GridSpec | None = None, climb: Climb | None =
     return costs
 
 
-def grown(pace: np.ndarray, target: int, rules: dict[str, Any]) -> CostToGoTree:
-    tree = CostToGoTree(loaded(pace, **rules))
-    tree.grow(target)
+def grown(costs: CostGrid, root: int) -> CostToGoTree:
+    """The tree of a map, grown from scratch."""
+    tree = CostToGoTree(costs)
+    tree.grow(root)
     return tree
 
 
 def assert_equals_dijkstra(pace: np.ndarray, target: int, rules: dict[str, Any], rtol: float = 1e-5) -> None:
-    tree = grown(pace, target, rules)
+    tree = grown(loaded(pace, **rules), target)
     mine, parents = inner(tree, tree.cost), inner(tree, tree.parent)
     best = naive.cost_to_go(pace, target, **rules)
     np.testing.assert_allclose(mine, np.where(np.isfinite(pace), best, np.inf), rtol=rtol)

@@ -76,8 +76,6 @@ class Autopilot:
             self.mode = int(params[1]) << 16 | int(params[2]) << 24
         elif command == codec.DO_SET_MODE:
             self.mode = int(params[1])
-        elif command != codec.MISSION_START:
-            return 0
         return 0
 
 

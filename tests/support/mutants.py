@@ -16,7 +16,6 @@ import argparse
 import ast
 import compileall
 import difflib
-import json
 import os
 import random
 import re
@@ -26,7 +25,7 @@ import subprocess
 import sys
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from cosmic_ray.ast import ast_nodes, get_ast_from_path
 from cosmic_ray.mutating import mutate_code
@@ -103,13 +102,9 @@ def _imports(path: Path) -> set[str]:
 class Suite:
     """Test files that see a module: those that import it, themselves or by a module of `tests/support`. If none
     does, those which see the modules of its core that import it.
-
-    near  of three groups only the first that is not empty: unit tests that import the module, laws that do, and all
-          that do by a module of `tests/support`
     """
 
-    def __init__(self, near: bool = False) -> None:
-        self._near = near
+    def __init__(self) -> None:
         folder = ROOT / "tests"
         support = {f"support.{path.stem}": _imports(path) for path in (folder / "support").glob("*.py")}
         files = [*sorted((folder / "unit").rglob("test_*.py")), *sorted((folder / "laws").glob("test_*.py"))]
@@ -126,10 +121,8 @@ class Suite:
         number of steps."""
         module = file.removesuffix(".py").replace("/", ".").removesuffix(".__init__")
         direct = [path for path, names in self._direct.items() if module in names]
-        unit = [path for path in direct if path.startswith("tests/unit")]
-        laws = [path for path in direct if path not in unit]
-        others = [path for path, names in self._by_support.items() if module in names and path not in direct]
-        found = (unit or laws or others) if self._near else [*unit, *laws, *others]
+        by_support = [path for path, names in self._by_support.items() if module in names]
+        found = list(dict.fromkeys([*direct, *by_support]))
         if not found and steps:
             users = [each for each, names in self._core.items() if module in names]
             return list(dict.fromkeys(test for user in users for test in self.of(user, steps - 1)))
@@ -186,8 +179,9 @@ def refresh_copy() -> None:
     compileall.compile_dir(COPY, quiet=2)
 
 
-def tried(mutant: Mutant, suite: Suite, limit_s: float) -> dict[str, Any]:
-    """Outcome of a mutant: killed, survived, or untested where no test sees its module in time."""
+def tried(mutant: Mutant, suite: Suite, limit_s: float) -> tuple[str, list[str], list[str]]:
+    """Outcome of a mutant, the test that killed it, and its difference. It is killed, has survived, or is untested
+    where no test sees its module in time."""
     path, tests = COPY / mutant.file, suite.of(mutant.file)
     source = path.read_text(encoding="utf-8")
     mutated = mutate_code(source, get_operator(mutant.operator)(), mutant.occurrence)
@@ -207,7 +201,7 @@ def tried(mutant: Mutant, suite: Suite, limit_s: float) -> dict[str, Any]:
         outcome = "untested"
     else:  # one that hangs is killed if all tests pass in that time without it
         outcome = "killed" if suite.passes(killer or tests, limit_s) else "untested"
-    return {**mutant._asdict(), "outcome": outcome, "killed_by": killer, "diff": diff}
+    return outcome, killer, diff
 
 
 def main() -> int:
@@ -220,8 +214,6 @@ def main() -> int:
     parser.add_argument("--most", type=int, default=50, help="a sample of so many mutants at most (50)")
     parser.add_argument("--seed", type=int, default=1, help="of the sample (1)")
     parser.add_argument("--seconds", type=float, default=300.0, help="for the tests of each mutant at most (300)")
-    parser.add_argument("--near", action="store_true", help="only the tests nearest to the module: a quick look")
-    parser.add_argument("--json", type=Path, help="write every mutant and its outcome here")
     chosen = parser.parse_args()
     since = chosen.since or (None if chosen.files or chosen.all else "HEAD~1")
     found: list[Mutant] = []
@@ -230,20 +222,13 @@ def main() -> int:
     sample = random.Random(chosen.seed).sample(found, min(chosen.most, len(found)))
     print(f"{len(sample)} of {len(found)} mutants", file=sys.stderr)
     refresh_copy()
-    suite, results = Suite(chosen.near), []
+    suite, counts = Suite(), dict.fromkeys(("killed", "survived", "untested"), 0)
     for number, mutant in enumerate(sample, 1):  # stopped early, it was a smaller sample
-        result = tried(mutant, suite, chosen.seconds)
-        results.append(result)
-        print(
-            f"{number}/{len(sample)} {result['outcome']:8} {mutant.file}:{mutant.line}",
-            *result["killed_by"],
-            file=sys.stderr,
-        )
-        if result["outcome"] != "killed":
-            print("\n".join(f"    {line}" for line in result["diff"]), file=sys.stderr)
-    if chosen.json:
-        chosen.json.write_text(json.dumps(results, indent=1), encoding="utf-8")
-    counts = {name: sum(each["outcome"] == name for each in results) for name in ("killed", "survived", "untested")}
+        outcome, killer, diff = tried(mutant, suite, chosen.seconds)
+        counts[outcome] += 1
+        print(f"{number}/{len(sample)} {outcome:8} {mutant.file}:{mutant.line}", *killer, file=sys.stderr)
+        if outcome != "killed":
+            print("\n".join(f"    {line}" for line in diff), file=sys.stderr)
     print(", ".join(f"{many} {name}" for name, many in counts.items()))
     return 1 if counts["survived"] or counts["untested"] else 0
 

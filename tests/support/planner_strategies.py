@@ -13,7 +13,7 @@ from planner_service.strategy import ROWS
 from shared_map.terrain.slope_and_climb import ENTRIES, Climb, Wind, climb_of
 from swarm.config.ground import CostConfig, SlopeRule
 from swarm.config.scenario import PlannerConfig
-from swarm.grid import GridSpec
+from swarm.grid import GridSpec, Window
 
 STRATEGIES = (*ROWS, "auto")
 
@@ -33,6 +33,32 @@ def random_pace(rng: np.random.Generator, rows: int, cols: int, ratio: float, wa
     if not np.isfinite(pace).any():
         pace[rng.integers(rows), rng.integers(cols)] = 1.0
     return pace
+
+
+def open_cell(rng: np.random.Generator, pace: NDArray[np.float32]) -> int:
+    return int(rng.choice(np.flatnonzero(np.isfinite(pace))))
+
+
+def cell_near(rng: np.random.Generator, grid: GridSpec, cell: int, far: int) -> int:
+    """A random cell of the grid, at most `far` rows and columns away."""
+    row, col = grid.row_col(cell) + rng.integers(-far, far + 1, 2)
+    return grid.cell(int(np.clip(row, 0, grid.rows - 1)), int(np.clip(col, 0, grid.cols - 1)))
+
+
+def random_window(rng: np.random.Generator, pace: NDArray[np.float32], high: int, wide: int) -> Window:
+    """A rectangle somewhere on a map, of this size at most: the border cuts it off."""
+    row, col = (int(rng.integers(side)) for side in pace.shape)
+    return Window(row, col, min(row + high, pace.shape[0]), min(col + wide, pace.shape[1]))
+
+
+def inside(pace: NDArray[np.float32], window: Window) -> NDArray[np.float32]:
+    """View of the cells in a window."""
+    return pace[window.row0 : window.row1, window.col0 : window.col1]
+
+
+def change(rng: np.random.Generator, patch: NDArray[np.float32], factor: float) -> None:
+    """Multiplies paces by a factor; 0 draws them again, lethal ones too."""
+    patch[:] = patch * np.float32(factor) if factor else random_pace(rng, *patch.shape, 5.0, 0.3)
 
 
 def random_climb(rng: np.random.Generator, grid: GridSpec, relief_m: float, steepest: float) -> Climb:

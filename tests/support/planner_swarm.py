@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from typing import Any
 
@@ -10,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from support.makers import target_pose
 from support.scripted_planner import chasers
-from support.slow_twins import cost_to_go
+from support.slow_twins import cost_to_go, drive
 from support.swarm_model import SwarmModel
 
 from planner_service.growth_times import MODEL_EXACT_NS_PER_CELL
@@ -22,12 +21,12 @@ from swarm.bus.memory_bus import MemoryBus
 from swarm.bus.scheduler import InlineWorker
 from swarm.clock import NS_PER_S
 from swarm.config.scenario import PlannerConfig, Scenario, Strategy, TargetConfig
-from swarm.grid import GridSpec, walk
+from swarm.grid import GridSpec
 from swarm.wire.messages import Message
 from swarm.wire.messages.map_data import MarkKind
 from swarm.wire.messages.planning import RouteReply, RouteRequest
 from swarm.wire.messages.processes import Stats
-from swarm.wire.route_columns import Route
+from swarm.wire.route_columns import Route, RouteBatch
 from swarm.wire.topics import CHASERS, POSE, PUSHED_ROUTE, ROUTE, STATS, STATUS, Topic
 
 ROWS, COLS, RES = 40, 50, 10.0
@@ -55,10 +54,8 @@ def optimum_s(pace: NDArray[np.float32], target: int) -> NDArray[np.float64]:
 
 
 def driven_s(pace: NDArray[np.float32], route: Route) -> float:
-    """Cost recomputed along the cells of a whole route."""
-    cells = walk(GRID, route.start, route.directions)
-    metres = [RES * (math.sqrt(2) if code % 2 else 1.0) for code in route.directions]
-    return sum(float(pace.flat[cell]) * m for cell, m in zip(cells[1:], metres, strict=True))
+    """Time that a whole route takes, step by step."""
+    return float(drive(GRID, PlannerConfig(), pace, None, RouteBatch.of([route])).time_s[0])
 
 
 class Ear:

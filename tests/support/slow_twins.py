@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import heapq
-import itertools
 import math
 from collections.abc import Iterator
 from typing import NamedTuple
@@ -25,27 +24,6 @@ Cells = NDArray[np.int64]
 def step_length(direction: int, edge: str) -> float:
     """In cells."""
     return math.sqrt(2.0) if direction % 2 and edge == "octile" else 1.0
-
-
-def steps(
-    pace: NDArray[np.float32], neighbours: int = 8, edge: str = "octile", corner_cutting: bool = False
-) -> list[tuple[int, int, float]]:
-    """Every step (u, v, cost) there is, by the rules."""
-    rows, cols = pace.shape
-    free = np.isfinite(pace)
-    found = []
-    for row, col in itertools.product(range(rows), range(cols)):
-        if not free[row, col]:
-            continue
-        for direction in range(0, 8, 2 if neighbours == 4 else 1):
-            r, c = row + STEP_ROW[direction], col + STEP_COL[direction]
-            if not (0 <= r < rows and 0 <= c < cols) or not free[r, c]:
-                continue
-            if direction % 2 and not corner_cutting and not (free[row, c] and free[r, col]):
-                continue
-            cost = float(pace[r, c]) * step_length(direction, edge)
-            found.append((row * cols + col, r * cols + c, cost))
-    return found
 
 
 def legal_steps(
@@ -132,24 +110,6 @@ def cost_to_go_in_float32(
                 best[v] = key + cost
                 heapq.heappush(heap, (best[v], v))
     return best.reshape(cell_cost.shape)
-
-
-def cost_to_go_by_hand(pace: NDArray[np.float32], target: int, **rules: object) -> NDArray[np.float64]:
-    """Like `cost_to_go`, in twelve readable lines, to keep watch over scipy and the graph it is given."""
-    into: dict[int, list[tuple[int, float]]] = {}
-    for u, v, cost in steps(pace, **rules):  # type: ignore[arg-type]
-        into.setdefault(v, []).append((u, cost))
-    best = np.full(pace.size, np.inf)
-    heap = [(0.0, target)]
-    while heap:
-        key, v = heapq.heappop(heap)
-        if best[v] <= key:
-            continue
-        best[v] = key
-        for u, cost in into.get(v, []):
-            if key + cost < best[u]:
-                heapq.heappush(heap, (key + cost, u))
-    return best.reshape(pace.shape)
 
 
 class Driven(NamedTuple):

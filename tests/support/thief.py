@@ -248,20 +248,14 @@ class ThiefWorld(TrafficWorld):
 
     def revoke(self) -> None:
         """The thief is silent from now on, and the others notice within two seconds."""
-        self.end_stolen()
+        self.end_all(self.stolen)
         self.revoked += 1
         for process in self.processes:
             self.at(self.chance.randrange(2 * NS_PER_S), lambda to=process: self.tell_revoked(to))
 
-    def end_stolen(self) -> None:
-        """Ends the processes under the stolen name."""
-        for process in [each for each in self.processes if each.agent == self.stolen]:
-            process.alive = False
-            self.processes.remove(process)
-
     def begin_again(self, kind: type[Process]) -> None:
         """The name has its next certificate, in the hands of its owner or a thief."""
-        self.end_stolen()
+        self.end_all(self.stolen)
         self.thief = kind
         self.start(self.stolen, self.disks[self.stolen][0])
 

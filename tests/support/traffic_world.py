@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-import heapq
 import random
 from collections import deque
 from collections.abc import Callable
 from dataclasses import dataclass, field
 from functools import cache
 
-from swarm.clock import NS_PER_S
+from swarm.bus.scheduler import Scheduler
+from swarm.clock import NS_PER_S, ManualClock
 from swarm.config.scenario import agent_of
 from swarm.grid import GridSpec
 from swarm.peers import Peer
@@ -261,7 +261,7 @@ class TrafficWorld:
         self.chance = random.Random(seed)
         self.faults = faults
         self.is_late = faults.tick_ns > TICK_NS
-        self.now_ns = 0
+        self._scheduler = Scheduler(ManualClock(0))
         self.grid = GridSpec(size, size, 1.0)
         names = [f"a{k}" for k in range(agents)]
         self.shards = Shards(self.grid, names, side, proven=proven)
@@ -285,8 +285,6 @@ class TrafficWorld:
         """Vehicle -> the disk of the process that placed it last."""
         self.placed = self.crashes = self.takeovers = self.twins = self.messages = 0
         self.cut: set[tuple[str, str]] = set()
-        self._events: list[tuple[int, int, Callable[[], None]]] = []
-        self._count = 0
         self.disks: dict[str, list[Disk]] = {name: [self.new_disk()] for name in names}
         self.unmoved = {vehicle: cell for each in self.spawns.values() for vehicle, cell in each.items()}
         self.processes: list[Process] = []
@@ -328,22 +326,23 @@ class TrafficWorld:
 
     # --- time, and the network ------------------------------------------------------------------------------
 
+    @property
+    def now_ns(self) -> int:
+        return self._scheduler.clock.now_ns()
+
     def at(self, delay_ns: int, action: Callable[[], None]) -> None:
-        self._count += 1
-        heapq.heappush(self._events, (self.now_ns + delay_ns, self._count, action))
+        """Does something later, unless vehicles have met until then."""
+        self._scheduler.after(delay_ns, lambda: None if self.collisions else action())
 
     def run(self, seconds: float) -> None:
-        end_ns = self.now_ns + int(seconds * NS_PER_S)
-        while self._events and self._events[0][0] <= end_ns and not self.collisions:
-            self.now_ns, _, action = heapq.heappop(self._events)
-            action()
-        self.now_ns = end_ns
+        self._scheduler.run_until(self.now_ns + int(seconds * NS_PER_S))
 
-    def assert_all_move(self, seconds: float) -> None:
+    def unmoved_in(self, seconds: float) -> list[str]:
+        """Vehicles that do not move in this time, in which no two meet."""
         before = dict(self.moves)
         self.run(seconds)
         assert self.collisions == []
-        assert [id for id in self.everybody() if self.moves.get(id, 0) == before.get(id, 0)] == []
+        return [id for id in self.everybody() if self.moves.get(id, 0) == before.get(id, 0)]
 
     def everybody(self) -> list[str]:
         return [id for vehicles in self.spawns.values() for id in vehicles]
@@ -451,6 +450,12 @@ class TrafficWorld:
         self.processes.remove(process)
         self.crashes += 1
         self.at(int(self.chance.random() * 2 * NS_PER_S), lambda: self.restart(process))
+
+    def end_all(self, agent: str) -> None:
+        """Ends the processes under a name."""
+        for process in [each for each in self.processes if each.agent == agent]:
+            process.alive = False
+            self.processes.remove(process)
 
     def restart(self, process: Process) -> None:
         if not any(other.disk is process.disk for other in self.processes):

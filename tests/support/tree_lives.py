@@ -12,34 +12,15 @@ from dataclasses import dataclass, field
 from typing import get_args
 
 import numpy as np
-from numpy.typing import NDArray
-from support.planner_play import Play
+from support.planner_play import LAWS as LAWS
+from support.planner_play import Play, Seconds
 from support.planner_strategies import RULES, Job, Marks, Move, random_climb, random_pace
-from support.slow_twins import Cells, Driven, cost_to_go, drive
+from support.slow_twins import Cells
 
 from planner_service.kernel_build import load_all
 from swarm.config.scenario import PlannerConfig, Strategy
 from swarm.grid import GridSpec
-from swarm.wire.route_columns import LETHAL_START, OK, UNREACHABLE, RouteBatch
-
-Seconds = NDArray[np.float64]
-
-LAWS = {
-    "status": "a cell has a route exactly where there is a way",
-    "legal": "a route breaks no rule and ends at the target",
-    "bound": "no way is quicker than the lower bound",
-    "optimum": "no route is quicker than the best way",
-    "stated": "a whole route's stated cost is driven, within 1e-6",
-    "cut": "a cut route's stated cost is driven, and so is what remains, within 1e-6",
-    "batch": "a route has the same numbers alone, in a batch and asked for again",
-    "exact": "the route of an exact tree is as good as any, within float32",
-}
-"""Checks of every route, and the name of each violation."""
-
-STATED = 1e-6
-"""Relative; what a stated cost may be off by."""
-_FLOAT64 = 1e-12
-"""Relative; sums of float64 over other orders of the same steps."""
+from swarm.wire.route_columns import OK, RouteBatch
 
 
 @dataclass
@@ -68,6 +49,8 @@ class Findings:
             self.violations[law] += many
             self.worst[law] = max(self.worst.get(law, 0.0), float(np.nan_to_num(off[broken], nan=math.inf).max()))
             self.example.setdefault(law, seed)
+        if law in ("stated", "cut"):
+            self.stated = max(self.stated, float(off.max(initial=0.0)))
 
 
 def lives(seed: int) -> Iterator[Findings]:
@@ -133,8 +116,6 @@ class Life:
     def _check(self) -> None:
         if not self._tree.ready:
             return
-        ground = self._grid, self.config, self._pace, self._climb
-        best_s = self._best()
         every = np.arange(self._grid.cells)
         if self._rng.random() < 0.5:  # what a cut route says must not need the whole one to have been asked for
             cut = self._tree.routes(every, int(self._rng.integers(1, 12)))
@@ -143,45 +124,9 @@ class Life:
             whole = self._tree.routes(every)
             cut = self._tree.routes(every, int(self._rng.integers(1, 12)))
         self._findings.checks += 2 * every.size
-        self._check_statuses(whole, best_s)
-        self._check_statuses(cut, best_s)
-        there = np.flatnonzero(np.isfinite(best_s) & (whole.statuses == OK) & (cut.statuses == OK))
-        driven, first = drive(*ground, whole), drive(*ground, cut)
-        self._note("legal", np.where(driven.last[there] == self._play.target, 0.0, math.inf), 0.0)
-        if not (driven.last[there] == self._play.target).all():
-            return
-        self._check_stated(whole, cut, driven, first, there)
-        for routes in (whole, cut):
-            self._note("bound", _above(routes.lower_bound_s[there], best_s[there]), _FLOAT64)
-        self._note("optimum", _above(best_s[there], driven.time_s[there]), _FLOAT64)
-        if self._tree.strategy.is_exact:
-            best = self._best(self.config.length_weight)[there]
-            asked = driven.time_s[there] + self.config.length_weight * whole.length_m[there]
-            self._note("exact", _above(asked, best), self._grid.cells * 2.0**-23)
-        self._check_alone(whole, cut, there)
-
-    def _best(self, length_weight: float = 0.0) -> Seconds:
-        config, metres = self.config, self._grid.resolution_m
-        rules = (config.neighbours, config.edge, config.corner_cutting)
-        return metres * cost_to_go(self._pace, self._play.target, *rules, self._climb, length_weight).reshape(-1)
-
-    def _check_statuses(self, routes: RouteBatch, best_s: Seconds) -> None:
-        expected = np.where(np.isfinite(best_s), OK, UNREACHABLE)
-        expected[~np.isfinite(self._pace).reshape(-1)] = LETHAL_START
-        self._note("status", np.where(routes.statuses == expected, 0.0, math.inf), 0.0)
-
-    def _check_stated(
-        self, whole: RouteBatch, cut: RouteBatch, driven: Driven, first: Driven, there: Cells
-    ) -> None:
-        time_s = driven.time_s[there]
-        off = _apart(whole.cost_s[there], time_s)
-        self._note("stated", off, STATED)
-        rest = driven.time_s[first.last[there]]
-        for stated, is_driven in ((cut.cost_s[there], time_s), (cut.remaining_s[there], rest)):
-            cut_off = _apart(stated, is_driven)
-            self._note("cut", cut_off, STATED)
-            off = np.concatenate((off, cut_off))
-        self._findings.stated = max(self._findings.stated, float(off.max(initial=0.0)))
+        for law, off, allowed in self._play.measured(whole, cut):
+            self._note(law, off, allowed)
+        self._check_alone(whole, cut, np.flatnonzero((whole.statuses == OK) & (cut.statuses == OK)))
 
     def _check_alone(self, whole: RouteBatch, cut: RouteBatch, there: Cells) -> None:
         if not there.size:
@@ -196,13 +141,3 @@ class Life:
 
     def _note(self, law: str, off: Seconds, allowed: float) -> None:
         self._findings.note(law, off, allowed, self._seed)
-
-
-def _above(one: Seconds, other: Seconds) -> Seconds:
-    """Relative excess of one over the other; 0 where it is not larger."""
-    with np.errstate(divide="ignore", invalid="ignore"):
-        return np.where(one <= other, 0.0, one / other - 1.0)
-
-
-def _apart(one: Seconds, other: Seconds) -> Seconds:
-    return np.maximum(_above(one, other), _above(other, one))

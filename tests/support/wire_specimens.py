@@ -11,41 +11,22 @@ that the build knows of the type and the message as it writes it again, or with 
 from __future__ import annotations
 
 import sys
-from typing import TYPE_CHECKING
 
-from hypothesis import HealthCheck, Phase, given, settings
 from support.wire_strategies import EXAMPLES, MESSAGES
 
 from swarm.errors import ProtocolError
 from swarm.wire.codec import decode, encode
-
-if TYPE_CHECKING:  # where it stands differs between versions
-    from swarm.wire.messages import Message
 
 LONGEST_BYTES = 2000
 """Upper bound on a specimen."""
 KINDS = {kind.__name__: kind for kind in MESSAGES}
 
 
-def drawn(kind: type[Message], many: int) -> list[Message]:
-    """Messages of a type, with all that its fields may hold."""
-    found: list[Message] = []
-
-    @settings(
-        max_examples=many, database=None, deadline=None, phases=[Phase.generate],
-        suppress_health_check=list(HealthCheck),
-    )  # fmt: skip
-    @given(MESSAGES[kind])
-    def draw(message: Message) -> None:
-        found.append(message)
-
-    draw()
-    return found
-
-
 def lines(many: int) -> list[str]:
     """The examples, and `many` more messages of each type."""
-    messages = [*EXAMPLES, *(message for kind in MESSAGES for message in drawn(kind, many))]
+    from support.wire_strategies import message_of  # a build that reads may have none
+
+    messages = [*EXAMPLES, *(message_of(kind, 50 + n) for kind in MESSAGES for n in range(many))]
     written = [(type(message).__name__, encode(message)) for message in messages]
     return list(
         dict.fromkeys(f"{name} {payload.hex()}" for name, payload in written if len(payload) < LONGEST_BYTES)

@@ -18,7 +18,7 @@ from swarm.wire.route_columns import Route, RouteBatch, RouteStatus
 _GRID = GridSpec(300, 200, 10.0)
 
 
-def _message(kind: type[Message], seed: int) -> Message:
+def message_of(kind: type[Message], seed: int) -> Message:
     return MessageFuzzer(_GRID, seed).message(kind)
 
 
@@ -28,7 +28,7 @@ def types_of_the_wire() -> list[type[Message]]:
 
 
 MESSAGES: dict[type[Message], st.SearchStrategy[Message]] = {
-    kind: st.integers(0, (1 << 64) - 1).map(partial(_message, kind)) for kind in types_of_the_wire()
+    kind: st.integers(0, (1 << 64) - 1).map(partial(message_of, kind)) for kind in types_of_the_wire()
 }
 
 _NAMED: tuple[Message, ...] = (
@@ -57,7 +57,7 @@ _NAMED: tuple[Message, ...] = (
 
 def _example(kind: type[Message]) -> Message:
     """The message of a type, of 50, in which the fewest columns, lists and texts are empty."""
-    return max((_message(kind, seed) for seed in range(50)), key=_filled)
+    return max((message_of(kind, seed) for seed in range(50)), key=_filled)
 
 
 def _filled(message: Message) -> int:

@@ -6,9 +6,7 @@ import pytest
 from support.bus_behaviour import *  # noqa: F403
 from support.bus_world import Box, answering, asked, pose
 from support.makers import run_info
-from support.query_behaviour import *  # noqa: F403
 from support.swarm_model import START_NS, LossyLinks, SwarmModel
-from support.trusted_behaviour import *  # noqa: F403
 
 from swarm.bus import memory_bus
 from swarm.bus.bus import AskEnded, Disappeared, Replied, WorkDone
