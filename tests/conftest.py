@@ -8,9 +8,10 @@ from __future__ import annotations
 import os
 import tempfile
 from pathlib import Path
+from typing import Any
 
 import pytest
-from hypothesis import settings
+from hypothesis import HealthCheck, settings
 from support.effort import few, try_all
 
 from swarm.runtime import loop_health
@@ -40,15 +41,13 @@ def pytest_addoption(parser: pytest.Parser) -> None:
 
 def pytest_configure(config: pytest.Config) -> None:
     loop_health.refused = True
-    # No deadline: on a busy machine a test is not to fail for taking long.
     if config.getoption("--thorough"):
         try_all()
-    if config.getoption("--random"):
-        settings.register_profile("ours", max_examples=few(EXAMPLES), deadline=None, print_blob=True)
-    else:
-        settings.register_profile(
-            "ours", max_examples=few(EXAMPLES), deadline=None, derandomize=True, database=None
-        )
+    random: dict[str, Any] = {"print_blob": True}
+    fixed: dict[str, Any] = {"derandomize": True, "database": None}
+    # On a busy machine a test is not to fail for taking long.
+    patient = settings(max_examples=few(EXAMPLES), deadline=None, suppress_health_check=[HealthCheck.too_slow])
+    settings.register_profile("ours", patient, **(random if config.getoption("--random") else fixed))
     settings.load_profile("ours")
 
 

@@ -6,7 +6,6 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-from hypothesis import HealthCheck, settings
 from hypothesis import strategies as st
 
 from shared_map.replication.marks import NO_STATEMENT, Statements, mark_set, sparse
@@ -17,11 +16,6 @@ from swarm.config.vehicle_classes import MOST_CLASSES
 from swarm.grid import GridSpec
 from swarm.wire.messages.map_data import SEQ_STEP, Digest, MarkKind, MarkSet, MarksRequest
 from swarm.wire.topics import DIGEST
-
-settings.register_profile(
-    "shared-cores", deadline=None, suppress_health_check=[HealthCheck.too_slow]
-)  # a busy machine is no failed law
-settings.load_profile("shared-cores")
 
 GRID = GridSpec(40, 70, 10.0)
 """2 x 3 tiles, those at the border cut off."""
