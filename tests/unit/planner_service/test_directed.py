@@ -1,13 +1,11 @@
 """Uphill is not downhill: the table of rises, and terrains of directed ground."""
 
-import math
 from typing import get_args
 
 import numpy as np
 import pytest
 
-from shared_map.terrain.slope_and_climb import ENTRIES, Climb, climb_of
-from shared_map.terrain.store import load_prepared, save_prepared
+from shared_map.terrain.slope_and_climb import Climb, climb_of
 from shared_map.terrain.synthetic import mountain_noise
 from shared_map.terrain.terrain import build_terrain
 from swarm.config.ground import CostConfig, TerrainConfig
@@ -34,36 +32,15 @@ def ramp(rows=3, cols=12, per_cell_m=1.0):
 # --- the table --------------------------------------------------------------------------------------------------
 
 
-def test_up_a_tenth_costs_more_than_double_and_down_it_nothing_more():
-    climb = climb_on(ramp())
-    assert climb.of_step(4, 5) == pytest.approx(2.24, abs=0.02)  # (1 + 0.1 / 0.08) / sqrt(1.01)
-    assert climb.of_step(5, 4) == 1.0
-    assert climb.of_step(5, 17) == 1.0  # along the slope
-    assert climb.of_step(5, 5) == 1.0  # a vehicle that turns back within its cell
-
-
-def test_a_walker_is_fastest_gently_downhill():
-    climb = climb_on(ramp(per_cell_m=0.5), "tobler")
-    assert climb.of_step(5, 4) == pytest.approx(math.exp(-3.5 * 0.05), rel=3e-3)
-    assert climb.lowest == pytest.approx(math.exp(-3.5 * 0.05), rel=3e-3)
-
-
-@pytest.mark.parametrize("rule", ["linear", "quadratic", "tobler", "energy"])
-@pytest.mark.parametrize("steepest_deg", [5, 35, 90])
-def test_no_step_is_steeper_than_ground_may_be_and_level_ground_costs_its_pace(rule, steepest_deg):
-    climb = climb_on(ramp(per_cell_m=1e4), rule, max_slope_deg=steepest_deg)
-    assert np.isfinite(climb.factors[1:-1]).all()
-    assert climb.factors[ENTRIES] == 1.0
-    assert climb.of_step(0, 1) == climb.factors[-1]
-    assert np.isinf(climb.factors[[0, -1]]).all() == (steepest_deg < 90)
-
-
 def test_a_step_beside_a_void_is_level():
     heights = ramp()
     heights[1, 5] = np.nan
     climb = climb_on(heights)
     assert climb.of_step(16, 17) == climb.of_step(17, 18) == 1.0
     np.testing.assert_array_equal(climb.along(np.array([16, 17]), np.array([17, 18])), 1.0)
+
+
+# --- in a run ---------------------------------------------------------------------------------------------------
 
 
 def test_one_step_and_many_steps_read_the_same_table():
@@ -73,9 +50,6 @@ def test_one_step_and_many_steps_read_the_same_table():
     tails, heads = np.array(pairs).T
     alone = np.array([climb.of_step(a, b) for a, b in pairs])
     np.testing.assert_array_equal(climb.along(tails, heads), alone.astype(np.float32))
-
-
-# --- in a run ---------------------------------------------------------------------------------------------------
 
 
 def scenario(**cost) -> Scenario:
@@ -91,14 +65,6 @@ def test_the_paces_of_a_directional_terrain_are_those_of_level_ground(tmp_path):
     assert one_way.digest == both_ways.digest
     assert any("level ground" in note for note in one_way.notes)
     assert build_terrain(scenario(classes=False, slope_rule="tobler")).digest != one_way.digest
-
-
-def test_a_prepared_terrain_keeps_its_climb(tmp_path):
-    terrain = build_terrain(scenario(slope_rule="tobler"))
-    save_prepared(tmp_path, terrain, terrain.ground_s_per_m)
-    loaded = load_prepared(tmp_path)
-    np.testing.assert_array_equal(loaded.climb.factors, terrain.climb.factors)
-    assert loaded.climb.of_step(100, 101) == terrain.climb.of_step(100, 101)
 
 
 def test_every_strategy_goes_with_direction_and_a_price_of_length_does_not():

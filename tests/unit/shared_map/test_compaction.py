@@ -8,12 +8,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.effort import few
 from support.map_strategies import AUTHORS, GRID, ZONES, Composite, held_winners, mark_sets, naive_winners, set_of
-from support.swarm_model import LossyLinks, SwarmModel
+from support.swarm_model import SwarmModel
 
 from shared_map.keeper.compaction import CompactionPlan, compact
 from shared_map.keeper.mark_store import KeeperStore
 from shared_map.replication.held_sets import REMEMBERED_NS, Tombstones
-from shared_map.replication.marks import base_seq, is_tombstone, mark_set, next_seq, statements
+from shared_map.replication.marks import is_tombstone, mark_set, statements
 from shared_map.replication.replica import MapReplica
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.clock import NS_PER_S
@@ -35,15 +35,6 @@ def test_a_statement_that_ends_by_itself_overrules_nothing_and_goes_when_it_has_
     (compacted,) = compact([lasting, ending], {}, {"a", "b"}, 500)
     assert compacted.author == "b"
     assert is_tombstone(compacted)
-
-
-def test_an_authors_next_set_stands_above_all_compacted_sets_of_the_last() -> None:
-    assert next_seq(0) == SEQ_STEP
-    assert next_seq(SEQ_STEP + 7) == 2 * SEQ_STEP
-    assert base_seq(SEQ_STEP + 7) == SEQ_STEP
-    last = set_of("a", 0, 1, {})
-    no_number_left = mark_set("a", "all", 0, 1, 2 * SEQ_STEP - 1, statements(last))
-    assert compact([no_number_left], {}, {"a"}, 0) == []
 
 
 def test_under_the_last_number_all_that_was_dropped_is_put_back() -> None:
@@ -169,23 +160,6 @@ def test_two_keepers_that_compact_with_different_knowledge_lose_no_winner(sets: 
 # --- the parts ----------------------------------------------------------------------------------------------
 
 
-def test_a_store_sets_aside_what_a_compaction_drops_until_its_author_says_something_newer() -> None:
-    store = KeeperStore(":memory:")
-    own = set_of("a", 0, 1, {1: (LETHAL, 0, 10), 2: (LETHAL, 0, 10)})
-    store.save([own])
-    first = mark_set("a", "all", 0, 1, own.seq + 1, statements(set_of("a", 0, 1, {2: (LETHAL, 0, 10)})))
-    store.save([first], now_ns=100)
-    assert list(store.load()) == [first]
-    assert cells_of(store.set_aside(0)["a"]) == [1]
-    tombstone = mark_set("a", "all", 0, 1, own.seq + 2, statements(set_of("a", 0, 1, {})))
-    store.save([tombstone], now_ns=200)
-    assert list(store.load()) == []
-    assert cells_of(store.set_aside(0)["a"]) == [1, 2]
-    assert store.tiles_set_aside() == [0]
-    store.save([set_of("a", 0, 2, {3: (LETHAL, 0, 30)})])
-    assert store.set_aside(0) == {}
-
-
 def test_tombstones_give_way_to_what_is_newer_and_are_forgotten_in_time() -> None:
     tombstones = Tombstones()
     tombstone = mark_set("a", "all", 0, 1, SEQ_STEP + 1, statements(set_of("a", 0, 1, {})))
@@ -237,29 +211,6 @@ def test_a_tile_is_due_when_an_author_dies_or_is_alive_after_all_or_an_earlier_o
 
 
 # --- services -----------------------------------------------------------------------------------------------
-
-
-def test_an_author_that_was_only_cut_off_says_all_again() -> None:
-    links = LossyLinks(1)
-    swarm = SwarmModel(links)
-    swarm.scenario = Scenario(map=MapConfig(compact_after_s=5))
-    keeper = swarm.keeper("keeper", KeeperStore(":memory:"))
-    cut_off, other = swarm.writer("a1.1"), swarm.writer("b1.1")
-    swarm.run(2)
-    cut_off.sync.publish(cut_off.replica.write([5, 6], LETHAL, 0.0, swarm.now_ns))
-    swarm.run(1)
-    other.sync.publish(other.replica.write([5], CLEAR, 0.0, swarm.now_ns))
-    swarm.run(1)
-    swarm.kill("b1.1")
-    links.far_side = {"a1.1"}
-    swarm.run(20)
-    assert keeper.replica.held.capacity.marks == 2  # of three
-    links.far_side = set()
-    cut_off.sync.publish(cut_off.replica.write([7], LETHAL, 0.0, swarm.now_ns))
-    swarm.run(5)
-    assert held_winners(keeper.replica) == held_winners(cut_off.replica)
-    assert {cell for _, cell in held_winners(keeper.replica)} == {5, 6, 7}
-    assert keeper.replica.held.fingerprint() == cut_off.replica.held.fingerprint()
 
 
 def test_a_full_disk_compacts_nothing_and_a_store_grows_no_more_than_the_ground() -> None:

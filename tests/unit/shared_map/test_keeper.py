@@ -27,13 +27,6 @@ def some_sets(count: int = 5) -> list[MarkSet]:
     return [set_of("a", tile, 1, {tile: (LETHAL, 0, 10 + tile)}) for tile in range(count)]
 
 
-def test_an_older_set_never_replaces_a_newer_one_in_the_store() -> None:
-    store = KeeperStore(":memory:")
-    store.save([set_of("a", 0, 5, {}, epoch=2)])
-    store.save([set_of("a", 0, 9, {1: (LETHAL, 0, 1)}, epoch=1)])
-    assert list(store.load()) == [set_of("a", 0, 5, {}, epoch=2)]
-
-
 def test_the_log_beside_the_store_stays_small_however_much_is_written_again(tmp_path: Path) -> None:
     """Otherwise a small disk stays full: pages of the log remain until the file is cut."""
     log = tmp_path / "map.sqlite-wal"
@@ -48,16 +41,6 @@ def test_the_log_beside_the_store_stays_small_however_much_is_written_again(tmp_
                 keeper.saved(batch)
                 longest = max(longest, log.stat().st_size)
     assert longest < 3 << 20, "one batch more than its bound"
-
-
-def test_a_batch_is_what_one_commit_should_hold() -> None:
-    keeper = Keeper()
-    for tile in range(100):
-        keeper.accept(set_of("a", tile, 1, dict.fromkeys(range(1024), (LETHAL, 0, 1))))
-    batches = list(keeper.batches())
-    assert sum(map(len, batches)) == 100
-    assert len(batches) > 2
-    assert max(map(len, batches)) < 60
 
 
 def test_of_two_keepers_on_one_store_whose_lock_was_deleted_one_ends_and_no_set_is_lost(tmp_path: Path) -> None:
@@ -128,12 +111,6 @@ def test_a_keeper_refuses_a_store_whose_marks_for_one_class_would_be_for_another
         SwarmModel(terrain=terrain, scenario=scenario).keeper("keeper", store)
 
 
-def test_a_store_in_use_is_refused(tmp_path: Path) -> None:
-    with KeeperStore(tmp_path / "map.sqlite"), pytest.raises(StoreError, match="in use by another keeper"):
-        KeeperStore(tmp_path / "map.sqlite")
-    KeeperStore(tmp_path / "map.sqlite").close()
-
-
 def test_a_store_can_be_read_while_a_keeper_writes_it(tmp_path: Path) -> None:
     with KeeperStore(tmp_path / "a map.sqlite") as store:
         store.save(some_sets(2))
@@ -181,33 +158,6 @@ def test_a_row_that_another_hand_has_changed_is_damage_and_rebuilding_begins_an_
         assert list(store.load()) == some_sets()
     with sqlite3.connect(tmp_path / "map.sqlite.damaged-1") as db:
         assert db.execute("SELECT count(*) FROM sets").fetchone()[0] >= 4
-
-
-def test_a_store_without_a_witness_gets_one_when_it_is_opened(tmp_path: Path) -> None:
-    path, lock = tmp_path / "map.sqlite", tmp_path / "map.sqlite.lock"
-    with KeeperStore(path) as store:
-        store.save(some_sets(2))
-        before = path.read_bytes()
-        store.save(some_sets(3))
-    lock.unlink()
-    KeeperStore(path).close()
-    path.write_bytes(before)
-    with pytest.raises(
-        DamagedError, match=r"is an older version: expected 3 records or commits, found 1; to use it"
-    ):
-        KeeperStore(path)
-    lock.unlink()
-    KeeperStore(path).close()
-
-
-def test_damage_that_comes_up_while_a_keeper_runs_is_noticed_at_the_row(tmp_path: Path) -> None:
-    path = tmp_path / "map.sqlite"
-    with KeeperStore(path) as store:
-        store.save(some_sets())
-        with sqlite3.connect(path) as db:
-            db.execute("UPDATE sets SET seq = seq + 1 WHERE tile = 3")
-        with pytest.raises(DamagedError, match="row 3, 'a' of table sets"):
-            list(store.load())
 
 
 def test_a_folder_that_cannot_be_written_is_told_of(tmp_path: Path) -> None:
@@ -275,19 +225,6 @@ def test_the_marks_of_the_dead_outlive_the_keeper(tmp_path: Path) -> None:
     late = swarm.listener("late")
     swarm.run(1)
     assert late.replica.held.fingerprint() == author.replica.held.fingerprint()
-
-
-def test_an_author_that_lives_is_never_taken_for_dead() -> None:
-    swarm = SwarmModel(scenario=Scenario(map=MapConfig(compact_after_s=5)))
-    store = KeeperStore(":memory:")
-    keeper, author, other = swarm.keeper("k", store), swarm.writer("a1.1"), swarm.writer("a2.1")
-    for each in (author, other):  # what the second says of the cell overrules the first, for good
-        swarm.run(1)
-        each.sync.publish(each.replica.write([0], MarkKind.LETHAL, 0.0, swarm.now_ns))
-    swarm.run(30)
-    own = author.replica.held.get(0, "a1.1")
-    assert (own.epoch, len(own.cells)) == (1, 2)
-    assert keeper.counters.counts["sets_folded"] == 0
 
 
 def test_what_a_dead_author_learned_stays_as_it_was_said_while_its_marks_are_compacted() -> None:

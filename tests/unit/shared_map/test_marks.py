@@ -1,15 +1,14 @@
 """Marks: which set and which statement win, and what a set changes."""
 
-import msgspec
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from support.map_strategies import GRID, mark_sets, set_of
+from support.map_strategies import GRID, set_of
 
 from shared_map.replication import merge as merge_module
-from shared_map.replication.marks import NO_STATEMENT, HybridClock, dense, fault, zone_author
-from shared_map.replication.merge import TileChange, new_winners, winners
+from shared_map.replication.marks import NO_STATEMENT, HybridClock, fault, zone_author
+from shared_map.replication.merge import TileChange, new_winners
 from shared_map.replication.tiles import grid_cells, region_tiles, tile_cells, tile_corners
 from swarm.wire.messages.map_data import STAMP_LIMIT_NS, MarkKind, MarkSet
 
@@ -64,26 +63,6 @@ def test_of_two_statements_of_one_stamp_that_of_the_larger_author_wins_and_a_zon
     for sets, pace in (([first, second], 3.0), ([zone, first, second], 4.0)):
         won = new_winners(GRID, [TileChange(0, [], sorted(sets, key=_author))], 0, 0)
         assert (won.cells.tolist(), won.paces.tolist()) == ([5], [pace])
-
-
-@given(mark_sets(), st.none() | mark_sets(), st.lists(mark_sets(), max_size=3))
-def test_the_difference_that_a_set_makes_is_that_between_before_and_after(new, old, more):
-    others = list({each.author: each for each in more if each.author != new.author}.values())
-    own = [] if old is None else [msgspec.structs.replace(old, author=new.author)]
-    held = sorted([*others, *own], key=_author)
-    since = sorted([*others, new], key=_author)
-    before, after = dense(winners(held, 0)), dense(winners(since, 0))
-    differs = np.flatnonzero((before.kinds != after.kinds) | (before.paces != after.paces))
-    for few in (-1, 10**9):  # by arrays and by lists
-        with pytest.MonkeyPatch.context() as patch:
-            patch.setattr(merge_module, "_FEW", few)
-            changed = new_winners(GRID, [TileChange(0, held, since)], 0, 0)
-        assert changed.counts == [len(differs)]
-        order = np.argsort(changed.cells)
-        assert changed.cells[order].tolist() == grid_cells(GRID, tile_corners(GRID, 0), differs).tolist()
-        assert changed.kinds[order].tolist() == after.kinds[differs].tolist()
-        assert changed.paces[order].tolist() == after.paces[differs].tolist()
-        assert changed.stamps_ns[order].tolist() == after.stamps_ns[differs].tolist()
 
 
 def _author(of: MarkSet) -> str:

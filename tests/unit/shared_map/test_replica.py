@@ -2,40 +2,16 @@
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
-from support.map_strategies import GRID, Composite, merge_one, replica_of, retract, set_of, sets_asked
+from support.map_strategies import GRID, Composite, merge_one, replica_of, retract, set_of
 
-from shared_map.replication.marks import MAX_AHEAD_NS, Statements, mark_set, statements
+from shared_map.replication.marks import MAX_AHEAD_NS, mark_set, statements
 from shared_map.replication.replica import MapReplica
 from swarm.clock import NS_PER_S
 from swarm.errors import OutsideGridError
-from swarm.wire.messages.map_data import SEQ_STEP, MarkKind, MarkSet, MarksRequest
+from swarm.wire.messages.map_data import SEQ_STEP, MarkKind
 
 PACE, LETHAL, CLEAR = MarkKind.PACE, MarkKind.LETHAL, MarkKind.CLEAR
 NOW = 1_000 * NS_PER_S
-
-
-def test_merge_returns_the_cells_that_changed_and_nothing_for_what_is_known() -> None:
-    replica, composite = replica_of([])
-    first = set_of("a", 4, 1, {0: (LETHAL, 0, 10), 33: (PACE, 2.0, 10)})
-    assert merge_one(replica, first) == [32 * 70 + 32, 33 * 70 + 33]
-    assert merge_one(replica, first) is None
-    assert merge_one(replica, set_of("a", 4, 0, {1: (LETHAL, 0, 9)})) is None
-    grown = set_of("a", 4, 2, {0: (LETHAL, 0, 10), 33: (PACE, 2.0, 10), 34: (LETHAL, 0, 11)})
-    assert merge_one(replica, grown) == [33 * 70 + 34]
-    losing = set_of("b", 4, 1, {34: (PACE, 1.0, 1)})
-    assert merge_one(replica, losing) == []
-    assert replica.counts["marks_merged"] == 3
-    assert composite.kinds[33 * 70 + 34] == LETHAL
-
-
-def test_a_set_off_the_grid_is_refused() -> None:
-    replica, _ = replica_of([])
-    assert merge_one(replica, set_of("a", 8 * 7, 0, {})) is None
-    assert merge_one(replica, set_of("a", 6, 0, {1: (LETHAL, 0, 70)})) is None  # of tile 6, about learned factors
-    assert replica.counts["sets_refused"] == 2
-    assert replica.held.ledger.held() == {}
 
 
 def test_the_newest_stamp_is_that_of_marks_that_changed_the_map_since_last_asked() -> None:
@@ -53,14 +29,6 @@ def test_the_newest_stamp_is_that_of_marks_that_changed_the_map_since_last_asked
 def writer(author: str = "a1.1") -> tuple[MapReplica, Composite]:
     composite = Composite()
     return MapReplica(GRID, composite, author=author, publish_hz=10.0), composite
-
-
-def test_what_is_written_stands_at_once_and_goes_out_whole() -> None:
-    replica, composite = writer()
-    out = replica.write([5, 2 * 70], [LETHAL, PACE], [0.0, 2.0], NOW)
-    assert out == [set_of("a1.1", 0, 0, {5: (LETHAL, 0, NOW), 64: (PACE, 2.0, NOW)})]
-    assert composite.kinds[5] == LETHAL
-    assert composite.paces[2 * 70] == 2.0
 
 
 def test_a_tile_goes_out_at_most_ten_times_a_second() -> None:
@@ -99,15 +67,6 @@ def test_a_mark_taken_back_leaves_what_others_say() -> None:
     assert retract(replica, [6], NOW + 3 * NS_PER_S) == []
 
 
-def test_an_author_taken_for_dead_says_what_it_says_again_under_a_higher_epoch() -> None:
-    replica, composite = writer()
-    replica.write([5], [LETHAL], [0], NOW)
-    assert merge_one(replica, set_of("a1.1", 0, 70, {}, epoch=4)) is None
-    [action] = replica.tick(NOW + NS_PER_S)
-    assert action == set_of("a1.1", 0, 1, {5: (LETHAL, 0, NOW)}, epoch=5)
-    assert composite.kinds[5] == LETHAL
-
-
 def test_a_number_that_nothing_could_follow_does_not_silence_an_author() -> None:
     replica, composite = writer()
     replica.write([5], [LETHAL], [0], NOW)
@@ -124,48 +83,7 @@ def test_a_cell_outside_the_grid_and_a_writer_without_a_name_are_bugs() -> None:
         MapReplica(GRID).write([1], [LETHAL], [0], NOW)
 
 
-def test_a_request_is_narrowed_by_authors_tiles_and_the_asked_key() -> None:
-    sets = [set_of(author, tile, 1, {0: (LETHAL, 0, 1)}) for tile in (0, 3) for author in ("a", "b", "c")]
-    replica, _ = replica_of(sets)
-    some = MarksRequest(authors=["c", "a"], tiles=[3, 5, 3])
-    assert sets_asked(replica, MarksRequest()) == sets
-    assert sets_asked(replica, some) == [sets[3], sets[5]]
-    assert sets_asked(replica, MarksRequest(), author="b") == [sets[1], sets[4]]
-
-
 # --- marks that end by themselves ---------------------------------------------------------------------------
-
-
-def ending(author: str, cell: int, stamp_ns: int, until_ns: int, kind: MarkKind = LETHAL) -> MarkSet:
-    said = Statements(
-        np.array([cell], np.uint16),
-        np.array([kind], np.uint8),
-        np.zeros(1, np.float32),
-        np.array([stamp_ns], np.int64),
-        np.array([until_ns], np.int64),
-    )
-    return mark_set(author, "all", 0, 1, 0, said)
-
-
-@given(
-    st.lists(
-        st.builds(ending, st.sampled_from("abc"), st.integers(0, 2), st.integers(0, 9), st.integers(0, 19)),
-        max_size=6,
-    ),
-    st.data(),
-)
-def test_when_all_that_ends_has_ended_the_order_of_marks_and_ticks_does_not_show(sets, data):
-    composites = []
-    for _ in range(2):
-        replica, composite = replica_of([])
-        now_ns = 0
-        for each in data.draw(st.permutations(sets)):
-            replica.merge([each])
-            now_ns = data.draw(st.integers(now_ns, 12))
-            replica.tick(now_ns)
-        replica.tick(12)
-        composites.append(composite)
-    assert composites[0].same(composites[1])
 
 
 @pytest.mark.parametrize("untils_ns", [range(10**18, 10**18 + 500), range(10**18, 10**18 - 500, -1)])

@@ -3,9 +3,8 @@
 from collections import Counter
 from typing import Any
 
-import pytest
 from msgspec.structs import replace
-from support.agent_world import OPEN, AgentWorld, pace_of, scenario
+from support.agent_world import AgentWorld, pace_of, scenario
 from support.bus_world import answer_of
 from support.planner_swarm import planning
 
@@ -14,7 +13,6 @@ from shared_map.keeper.mark_store import KeeperStore
 from swarm.bus.bus import Event
 from swarm.wire.messages import Message
 from swarm.wire.messages.orders import GiveOrder, GoalState, SendVehicle, ZoneOrder
-from swarm.wire.messages.vehicles import VehicleState
 from swarm.wire.topics import GIVE_ORDER, GOAL_STATES, SEND_VEHICLE, ZONES, Topic
 
 
@@ -51,50 +49,6 @@ class SentWorld(AgentWorld):
 
     def states_of_goals(self) -> Counter[str]:
         return Counter(each.state for each in self.progress.values())
-
-
-def test_a_vehicle_goes_from_place_to_place_and_then_holds_chases_or_begins_again() -> None:
-    world = SentWorld(scenario(4, [(10, 10), (10, 11), (11, 10), (11, 11)]), OPEN)
-    world.send("a0-00", (3, 15), (15, 15))
-    world.send("a0-01", (15, 3), then="chase")
-    world.send("a1-00", (5, 18), (18, 18), then="repeat")
-    visited: list[tuple[int, int]] = []
-
-    def look() -> None:
-        cell = world.where()["a1-00"]
-        if cell in ((5, 18), (18, 18)) and visited[-1:] != [cell]:
-            visited.append(cell)
-
-    world.after_tick.append(look)
-    world.until(lambda: world.states_of_goals()["completed"] == 2, within_s=60)
-    assert world.where()["a0-00"] == (15, 15)
-    world.run(20)
-    assert world.where()["a0-00"] == (15, 15)
-    assert world.states()["a0-00"] is VehicleState.ARRIVED
-    chasing = {vehicle.id: vehicle.target for vehicle in world.vehicles()}
-    assert chasing["a0-01"] == chasing["a1-01"] == "t"
-    world.until(lambda: len(visited) >= 5, within_s=60)
-    assert visited[:5] == [(5, 18), (18, 18)] * 2 + [(5, 18)]
-    assert world.progress["a1-00"].done >= 4
-    world.send("a0-00", off=True)
-    world.send("a1-00", off=True)
-    world.until(lambda: {vehicle.target for vehicle in world.vehicles()} == {"t"}, within_s=5)
-    world.until(lambda: world.all_in(VehicleState.ARRIVED), within_s=60)
-    assert world.states_of_goals() == {"canceled": 2, "completed": 1}
-    world.assert_lawful()
-
-
-@pytest.mark.seeds(2)
-def test_fifty_vehicles_that_are_sent_to_one_cell_all_get_there(seed: int) -> None:
-    starts = [(2 + n // 10, 5 + n % 10) for n in range(50)]
-    text = scenario(50, starts, per_agent=10).replace("seed = 3", f"seed = {seed}")
-    world = SentWorld(text, OPEN)
-    for vehicle in world.vehicles():
-        world.send(vehicle.id, (14, 10))
-    world.until(lambda: world.states_of_goals() == {"completed": 50}, within_s=240)
-    near = [max(abs(row - 14), abs(col - 10)) for row, col in world.where().values()]
-    assert max(near) <= 4 + 1  # 81 cells within four steps are the first that are fifty or more
-    world.assert_lawful()
 
 
 def test_a_vehicle_that_holds_makes_way_in_a_corridor_and_goes_back() -> None:

@@ -19,18 +19,6 @@ def following(*cells: int, here: int | None = None) -> Follower:
     return route
 
 
-def test_a_route_is_joined_where_the_vehicle_stands_on_it() -> None:
-    route = following(11, 12, 13, 14, here=13)
-    assert route.ahead() == [14]
-    assert route.left == 1
-
-
-def test_a_route_that_does_not_pass_here_changes_nothing() -> None:
-    route = following(11, 12, 13)
-    assert not route.begin([44, 45], [11])
-    assert route.ahead() == [12, 13]
-
-
 def test_a_vehicle_that_was_pushed_comes_back_to_its_route_further_on() -> None:
     route = following(11, 12, 13, 14)
     route.moved(12)

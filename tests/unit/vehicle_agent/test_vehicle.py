@@ -121,13 +121,6 @@ def test_no_way_to_its_target_leaves_it_stranded_and_it_tries_again(waiting: Veh
     assert waiting.state is VehicleState.FOLLOWING
 
 
-def test_one_that_stands_on_its_route_while_no_way_leads_on_is_stranded(follower: Vehicle) -> None:
-    for at_rest, state in ((False, VehicleState.FOLLOWING), (True, VehicleState.STRANDED)):
-        follower.motion.at_rest = at_rest
-        follower.no_way()
-        assert follower.state is state
-
-
 def test_a_planner_that_has_not_seen_the_target_yet_is_asked_again(waiting: Vehicle) -> None:
     waiting.refuse_route("t0", RouteStatus.NO_TARGET, S)
     assert waiting.state is VehicleState.WAITING
