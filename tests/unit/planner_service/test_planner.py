@@ -89,6 +89,22 @@ def test_changes_wait_as_long_as_repairs_have_had_their_share_and_no_route_passe
         assert len(ready.tree.named("update")) == before + 1
 
 
+def test_the_tree_of_a_growth_that_a_worker_is_handed_is_adopted_and_served(world) -> None:
+    world.pose(10, 20)
+    world.mark(5)
+    world.tree.answers = [Update("none", wants_full=True)]
+    (grow,) = world.tick()
+    assert isinstance(grow, Work)
+    assert world.tree.named("full_job") == [("full_job", GRID.cell(10, 20), 1)]
+    assert world.tick() == []
+    assert not world.tree.ready
+    assert world.grow(grow, took_ns=5_000_000) == []
+    assert world.tree.named("adopt") == [("adopt", 1, GRID.cell(10, 20), [], 1)]
+    assert world.ask(0).routes[0].status is RouteStatus.OK
+    assert world.counters.counts["growths"] == 1
+    assert world.planner.status(0).growth_ms == 5.0
+
+
 def test_marks_seen_while_growing_cost_one_more_tree_not_one_each(ready: World) -> None:
     ready.tree.answers = [Update("none", wants_full=True)] * 4
     ready.mark(1)

@@ -43,6 +43,16 @@ def test_the_log_beside_the_store_stays_small_however_much_is_written_again(tmp_
     assert longest < 3 << 20, "one batch more than its bound"
 
 
+def test_a_batch_is_what_one_commit_should_hold() -> None:
+    keeper = Keeper()
+    for tile in range(100):
+        keeper.accept(set_of("a", tile, 1, dict.fromkeys(range(1024), (LETHAL, 0, 1))))
+    batches = list(keeper.batches())
+    assert sum(map(len, batches)) == 100
+    assert len(batches) > 2
+    assert max(map(len, batches)) < 60
+
+
 def test_of_two_keepers_on_one_store_whose_lock_was_deleted_one_ends_and_no_set_is_lost(tmp_path: Path) -> None:
     path, sets = tmp_path / "map.sqlite", some_sets()
     with KeeperStore(path) as first:
