@@ -160,6 +160,23 @@ def test_two_keepers_that_compact_with_different_knowledge_lose_no_winner(sets: 
 # --- the parts ----------------------------------------------------------------------------------------------
 
 
+def test_a_store_sets_aside_what_a_compaction_drops_until_its_author_says_something_newer() -> None:
+    store = KeeperStore(":memory:")
+    own = set_of("a", 0, 1, {1: (LETHAL, 0, 10), 2: (LETHAL, 0, 10)})
+    store.save([own])
+    first = mark_set("a", "all", 0, 1, own.seq + 1, statements(set_of("a", 0, 1, {2: (LETHAL, 0, 10)})))
+    store.save([first], now_ns=100)
+    assert list(store.load()) == [first]
+    assert cells_of(store.set_aside(0)["a"]) == [1]
+    tombstone = mark_set("a", "all", 0, 1, own.seq + 2, statements(set_of("a", 0, 1, {})))
+    store.save([tombstone], now_ns=200)
+    assert list(store.load()) == []
+    assert cells_of(store.set_aside(0)["a"]) == [1, 2]
+    assert store.tiles_set_aside() == [0]
+    store.save([set_of("a", 0, 2, {3: (LETHAL, 0, 30)})])
+    assert store.set_aside(0) == {}
+
+
 def test_tombstones_give_way_to_what_is_newer_and_are_forgotten_in_time() -> None:
     tombstones = Tombstones()
     tombstone = mark_set("a", "all", 0, 1, SEQ_STEP + 1, statements(set_of("a", 0, 1, {})))

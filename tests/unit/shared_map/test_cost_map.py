@@ -76,6 +76,14 @@ def test_any_sequence_of_marks_gives_the_composite_made_from_scratch(radius_m, b
     np.testing.assert_array_equal(cost_map.pace_s_per_m, from_scratch(prior, known))
 
 
+def test_what_changes_nothing_leaves_version_and_windows_alone() -> None:
+    cost_map = CostMap(terrain())
+    cost_map.apply(*marks((5, MarkKind.CLEAR, 0.0)))
+    cost_map.apply(np.zeros(0, np.uint32), np.zeros(0, np.uint8), np.zeros(0, np.float32))
+    assert cost_map.version == 0
+    assert cost_map.take_dirty() == []
+
+
 def test_dirty_windows_of_distant_marks_stay_apart_and_are_taken_once() -> None:
     cost_map = CostMap(terrain())
     cost_map.apply(*marks((0, MarkKind.LETHAL, 0.0), (ROWS * COLS - 1, MarkKind.PACE, 9.0)))

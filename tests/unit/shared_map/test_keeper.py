@@ -237,6 +237,19 @@ def test_the_marks_of_the_dead_outlive_the_keeper(tmp_path: Path) -> None:
     assert late.replica.held.fingerprint() == author.replica.held.fingerprint()
 
 
+def test_an_author_that_lives_is_never_taken_for_dead() -> None:
+    swarm = SwarmModel(scenario=Scenario(map=MapConfig(compact_after_s=5)))
+    store = KeeperStore(":memory:")
+    keeper, author, other = swarm.keeper("k", store), swarm.writer("a1.1"), swarm.writer("a2.1")
+    for each in (author, other):  # what the second says of the cell overrules the first, for good
+        swarm.run(1)
+        each.sync.publish(each.replica.write([0], MarkKind.LETHAL, 0.0, swarm.now_ns))
+    swarm.run(30)
+    own = author.replica.held.get(0, "a1.1")
+    assert (own.epoch, len(own.cells)) == (1, 2)
+    assert keeper.counters.counts["sets_folded"] == 0
+
+
 def test_what_a_dead_author_learned_stays_as_it_was_said_while_its_marks_are_compacted() -> None:
     swarm = SwarmModel(scenario=Scenario(map=MapConfig(compact_after_s=5, learning=True)))
     store = KeeperStore(":memory:")

@@ -165,6 +165,14 @@ def test_a_thin_wall_survives_every_level_and_paces_are_means_of_what_can_be_dri
         assert level.lethal_share.sum() * level.side**2 == pytest.approx(75, rel=0.1)
 
 
+def test_blocks_that_are_all_lethal_are_lethal() -> None:
+    pace = np.ones((8, 8), np.float32)
+    pace[:4, :4] = np.inf
+    level = level_of(terrain_of_pace(pace), 4)
+    assert np.isinf(level.pace_s_per_m).tolist() == [[True, False], [False, False]]
+    assert level.lethal_share.tolist() == [[1.0, 0.0], [0.0, 0.0]]
+
+
 def test_a_void_does_not_spread_through_the_levels() -> None:
     heights = np.full((16, 16), 5.0, np.float32)
     heights[3, 3] = np.nan

@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from rasterio.transform import Affine
 from scipy import ndimage
 from support.effort import few, paired
-from support.height_models import hills, is_water, load, written
+from support.height_models import SIDE, hills, is_water, load, written
 from support.water_models import MODELS, UNKNOWABLE, WaterModel, moved
 
 from shared_map.importers.plain_grids import read_npz
@@ -21,6 +21,18 @@ from shared_map.importers.terrain_sources import _jacksboro_path
 from shared_map.importers.water_and_voids import labelled, level_ground, level_patches, undeclared_voids
 
 # --- level ground -------------------------------------------------------------------------------------------
+
+
+@settings(max_examples=few(15))
+@given(st.integers(0, 10_000), st.floats(40, 600), st.floats(0.05, 0.7))
+def test_the_sea_is_found_whatever_share_it_has_and_dry_hills_are_not_taken(seed, relief_m, share):
+    ground = hills(seed, relief_m)
+    level_m = np.quantile(ground, share)
+    sea = ground <= level_m
+    found = level_ground(np.maximum(ground - level_m, 0).astype(np.float32)).mask
+    missed = sea & ~ndimage.binary_dilation(found, iterations=2)
+    assert missed.sum() <= 0.02 * sea.sum() + 30
+    assert (found & ~sea).sum() <= 0.03 * (~sea).sum()
 
 
 def test_a_lake_among_mountains_in_whole_metres_is_found_and_a_level_top_is_not() -> None:
@@ -285,6 +297,17 @@ def test_values_that_the_scenario_names_are_voids(tmp_path: Path) -> None:
 
 
 # --- patches of equal height ----------------------------------------------------------------------------------
+
+
+def test_a_text_grid_is_looked_at_alike(tmp_path: Path) -> None:
+    ground = np.maximum(hills(12, 900) - 300, 0)
+    ground[:3] = -9998
+    head = f"ncols {SIDE}\nnrows {SIDE}\nxllcorner 0\nyllcorner 0\ncellsize 20\n"
+    rows = "\n".join(" ".join(f"{height:.3f}" for height in row) for row in ground)
+    (tmp_path / "a.asc").write_text(head + rows)
+    source = load(tmp_path / "a.asc", resolution_m=30.0)
+    assert np.isnan(source.elevation_m[0]).all()
+    assert is_water(source).mean() == pytest.approx((ground == 0).mean(), abs=0.03)
 
 
 def stairs(seed: int, rows: int, cols: int, steps: float) -> np.ndarray:

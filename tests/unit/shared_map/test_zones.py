@@ -88,6 +88,16 @@ def test_a_zone_is_in_every_map_and_gone_once_it_is_removed(world: ZoneWorld) ->
     assert listed.zones == []
 
 
+def test_what_a_vehicle_finds_in_a_zone_does_not_open_it_and_counts_once_it_is_removed(world: ZoneWorld) -> None:
+    world.add()
+    inside = min(SQUARE_CELLS)
+    world.find(inside, kind=MarkKind.PACE, pace=3.0)
+    assert world.lethal() == SQUARE_CELLS
+    world.order(action="remove", name="z")
+    composite: Any = world.planner.replica._cost_map
+    assert (composite.kinds[inside], composite.paces[inside]) == (MarkKind.PACE, 3.0)
+
+
 def test_a_zone_of_a_pace_wins_too_and_the_newer_of_two_zones_counts(world: ZoneWorld) -> None:
     world.add("one")
     zones = world.add("two", kind="pace", pace_s_per_m=0.5)
