@@ -13,7 +13,7 @@ from support.swarm_model import SwarmModel
 from shared_map.keeper.compaction import CompactionPlan, compact
 from shared_map.keeper.mark_store import KeeperStore
 from shared_map.replication.held_sets import REMEMBERED_NS, Tombstones
-from shared_map.replication.marks import is_tombstone, mark_set, statements
+from shared_map.replication.marks import base_seq, is_tombstone, mark_set, next_seq, statements
 from shared_map.replication.replica import MapReplica
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.clock import NS_PER_S
@@ -35,6 +35,15 @@ def test_a_statement_that_ends_by_itself_overrules_nothing_and_goes_when_it_has_
     (compacted,) = compact([lasting, ending], {}, {"a", "b"}, 500)
     assert compacted.author == "b"
     assert is_tombstone(compacted)
+
+
+def test_an_authors_next_set_stands_above_all_compacted_sets_of_the_last() -> None:
+    assert next_seq(0) == SEQ_STEP
+    assert next_seq(SEQ_STEP + 7) == 2 * SEQ_STEP
+    assert base_seq(SEQ_STEP + 7) == SEQ_STEP
+    last = set_of("a", 0, 1, {})
+    no_number_left = mark_set("a", "all", 0, 1, 2 * SEQ_STEP - 1, statements(last))
+    assert compact([no_number_left], {}, {"a"}, 0) == []
 
 
 def test_under_the_last_number_all_that_was_dropped_is_put_back() -> None:

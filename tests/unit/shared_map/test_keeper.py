@@ -27,6 +27,13 @@ def some_sets(count: int = 5) -> list[MarkSet]:
     return [set_of("a", tile, 1, {tile: (LETHAL, 0, 10 + tile)}) for tile in range(count)]
 
 
+def test_an_older_set_never_replaces_a_newer_one_in_the_store() -> None:
+    store = KeeperStore(":memory:")
+    store.save([set_of("a", 0, 5, {}, epoch=2)])
+    store.save([set_of("a", 0, 9, {1: (LETHAL, 0, 1)}, epoch=1)])
+    assert list(store.load()) == [set_of("a", 0, 5, {}, epoch=2)]
+
+
 def test_the_log_beside_the_store_stays_small_however_much_is_written_again(tmp_path: Path) -> None:
     """Otherwise a small disk stays full: pages of the log remain until the file is cut."""
     log = tmp_path / "map.sqlite-wal"

@@ -124,6 +124,14 @@ def writer(author: str = "a1.1") -> tuple[MapReplica, Composite]:
     return MapReplica(GRID, composite, author=author, publish_hz=10.0), composite
 
 
+def test_what_is_written_stands_at_once_and_goes_out_whole() -> None:
+    replica, composite = writer()
+    out = replica.write([5, 2 * 70], [LETHAL, PACE], [0.0, 2.0], NOW)
+    assert out == [set_of("a1.1", 0, 0, {5: (LETHAL, 0, NOW), 64: (PACE, 2.0, NOW)})]
+    assert composite.kinds[5] == LETHAL
+    assert composite.paces[2 * 70] == 2.0
+
+
 def test_a_tile_goes_out_at_most_ten_times_a_second() -> None:
     replica, _ = writer()
     assert len(replica.write([5], [LETHAL], [0], NOW)) == 1

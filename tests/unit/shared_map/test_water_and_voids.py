@@ -46,6 +46,17 @@ def test_a_lake_among_mountains_in_whole_metres_is_found_and_a_level_top_is_not(
     assert not level_ground(top).mask[top == 550].any()
 
 
+def test_a_lake_that_differs_by_millimetres_is_one_lake() -> None:
+    ground = hills(4, 300)
+    lake = ground < 60
+    noise = np.random.default_rng(1).uniform(-0.001, 0.001, ground.shape)
+    heights = np.where(lake, 60 + noise, ground).astype(np.float32)
+    heights[0] = 300  # a border without sea
+    largest = max(height_cells[1] for height_cells in level_ground(heights).patches)
+    labels, _ = ndimage.label(ndimage.binary_erosion(lake, np.ones((3, 3))), np.ones((3, 3)))
+    assert largest >= 0.9 * np.bincount(labels.ravel())[1:].max()
+
+
 @pytest.mark.parametrize("rows", [160, 161, 163])
 @pytest.mark.parametrize("last_m", [np.nan, 93.0])
 def test_a_rough_lake_is_found_whatever_lies_beyond_its_last_block(rows: int, last_m: float) -> None:
