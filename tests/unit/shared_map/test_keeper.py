@@ -177,6 +177,23 @@ def test_a_row_that_another_hand_has_changed_is_damage_and_rebuilding_begins_an_
         assert db.execute("SELECT count(*) FROM sets").fetchone()[0] >= 4
 
 
+def test_a_store_without_a_witness_gets_one_when_it_is_opened(tmp_path: Path) -> None:
+    path, lock = tmp_path / "map.sqlite", tmp_path / "map.sqlite.lock"
+    with KeeperStore(path) as store:
+        store.save(some_sets(2))
+        before = path.read_bytes()
+        store.save(some_sets(3))
+    lock.unlink()
+    KeeperStore(path).close()
+    path.write_bytes(before)
+    with pytest.raises(
+        DamagedError, match=r"is an older version: expected 3 records or commits, found 1; to use it"
+    ):
+        KeeperStore(path)
+    lock.unlink()
+    KeeperStore(path).close()
+
+
 def test_a_folder_that_cannot_be_written_is_told_of(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(StoreError, match=r"cannot write .*file: File exists"):

@@ -1,5 +1,6 @@
 """Agents end to end on a simulated network: they follow, find out, mark, and come back from the dead."""
 
+import numpy as np
 import pytest
 from support.agent_world import OPEN, AgentWorld, pace_of, scenario
 
@@ -17,6 +18,23 @@ def test_vehicles_drive_to_the_target_and_arrive_as_soon_as_the_pace_allows() ->
     # 9 cells of 10 m at 0.1 s/m to come within 10 m of the target, and at most a second to get going.
     assert 8.5 <= took_s <= 11.5  # with a second in which it listens for obstacles
     assert world.where() == {"a0-00": (10, 11)}
+
+
+def test_a_vehicle_that_finds_the_road_closed_marks_it_and_takes_another() -> None:
+    prior = [
+        "###############",
+        "#.............#",
+        "#.###########.#",
+        "#.............#",
+        "###############",
+    ]
+    truth = list(prior)
+    truth[1] = "#......#......#"
+    world = AgentWorld(scenario(1, [(1, 1)]), pace_of(prior), pace_of(truth)).begin(t=(1, 13))
+    world.arrive(60)
+    assert world.count("marks") == 1
+    assert world.count("reroute_requests") >= 1
+    assert np.isinf(world.agents["a0"]._maps.common.ground_s_per_m[1, 7])
 
 
 def test_a_vehicle_that_an_obstacle_shuts_in_raises_an_alarm_until_the_obstacle_leaves() -> None:
@@ -78,7 +96,6 @@ def test_marks_of_one_agent_spare_another_the_detour() -> None:
     world.arrive(90)
     # The second turned off at the branch: it never came within its sensor's three cells of the closure.
     assert [service.counters.counts["marks"] for service in world.agents.values()] == [1, 0]
-    assert world.count("reroute_requests") >= 1
 
 
 def test_slow_ground_is_marked_and_driven_at_its_own_pace() -> None:
