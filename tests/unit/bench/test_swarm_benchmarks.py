@@ -5,6 +5,7 @@ import math
 import msgspec
 import pytest
 from bench.whole_swarm import crowd
+from bench.whole_swarm.ideal_crowd import drive_ideal
 from bench.whole_swarm.size import CELLS_PER_VEHICLE, scenario_of, size_of
 from bench.whole_swarm.stats_window import StatsWindow, ticks
 from hypothesis import given
@@ -14,6 +15,8 @@ from support.benchmarks import bench
 from support.makers import fleet_of
 
 from launch_scripts.launcher.run_options import find_scenario
+from launch_scripts.simulation.sample_worlds import CROWDS
+from launch_scripts.simulation.sample_worlds import crowd as crowded
 from swarm.config.scenario import plan_agents
 from swarm.runtime.stats import Counters
 from swarm.wire.messages.vehicles import Fleet, VehicleState
@@ -70,9 +73,6 @@ def test_a_window_counts_what_came_between_its_ends_in_any_order() -> None:
     assert window.silent([("agent", "a0"), ("agent", "a1"), ("keeper", "0")]) == ["agent a1", "keeper 0"]
 
 
-# --- several sizes ----------------------------------------------------------------------------------------------
-
-
 # --- crowds ------------------------------------------------------------------------------------------------------
 
 
@@ -96,6 +96,13 @@ def test_waits_speed_and_arrivals_are_counted_from_what_agents_publish() -> None
     assert drives.driven_cells == pytest.approx(7 * math.sqrt(2) + 1)
     assert drives.longest_confined["waits"] == 9
     assert drives.longest_confined["straight"] == 2  # three cells away from a place it is out of its box
+
+
+@pytest.mark.parametrize("kind", CROWDS)
+def test_an_ideal_crowd_drives_most_of_the_time_and_more_than_one_that_may_not_follow(kind: str) -> None:
+    _, terrain = crowded(kind, 3, 100, 25, 30)
+    flows = [drive_ideal(terrain.pace_s_per_m, 100, 3, 60, follow)["cells_per_step"] for follow in (True, False)]
+    assert 1.0 >= flows[0] > 1.2 * flows[1] > 0.0
 
 
 def test_a_small_crowd_is_driven() -> None:

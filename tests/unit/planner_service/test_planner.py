@@ -206,13 +206,6 @@ def test_growths_of_its_own_thread_are_measured_once_in_a_period_for_64_follower
     assert ready.counters.histograms["gap_excess"].count == measured
 
 
-def test_every_served_route_carries_its_proven_gap_into_the_books(ready: World) -> None:
-    ready.tree.gap = 1.25
-    ready.ask(0, 5, GRID.cells)
-    assert ready.counters.histograms["certified_gap_excess"].count == 2
-    assert ready.counters.counts["routes_served"] == 3
-
-
 def test_too_wide_a_gap_asks_for_one_full_growth_a_second(ready: World) -> None:
     ready.tree.gap = 1.6
     grows: list[Action] = []

@@ -1,11 +1,10 @@
 """A planner on a bus: its routes keep the laws while target, map and followers change, and after restarts."""
 
 import math
-import random
 
 import numpy as np
 import pytest
-from support.planner_swarm import COLS, GRID, RENEWS, RES, ROWS, Swarm, driven_s, flat, optimum_s, rough
+from support.planner_swarm import GRID, RENEWS, RES, Swarm, flat, rough
 from support.scripted_planner import TRACKED
 
 from planner_service.kernel_build import load_all
@@ -14,11 +13,10 @@ from planner_service.target_search import TargetSearch
 from planner_service.target_tree import TargetTree
 from planner_service.tracker_notes import TargetWatch
 from shared_map.cost_map import CostMap
-from shared_map.keeper.mark_store import KeeperStore
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.bus.bus import Replied
 from swarm.config.scenario import PlannerConfig
-from swarm.grid import GridSpec, walk
+from swarm.grid import GridSpec
 from swarm.runtime.stats import Counters
 from swarm.wire.codec import encode
 from swarm.wire.fields import column
@@ -37,26 +35,6 @@ from swarm.wire.topics import COST, ROUTE
 @pytest.fixture(scope="module", autouse=True)
 def _compiled() -> None:
     load_all()
-
-
-def test_half_a_second_after_the_first_pose_routes_are_the_best_there_are() -> None:
-    pace = rough(3)
-    target = GRID.cell(20, 30)
-    swarm = Swarm(pace)
-    swarm.cells["t"] = target
-    swarm.run(0.5)
-    starts = np.flatnonzero(np.isfinite(pace.ravel()))[::17].tolist()
-    reply = swarm.ear.routes(*starts)
-    best = optimum_s(pace, target)
-    assert (reply.target, reply.target_cell, reply.rows, reply.cols) == ("t", target, ROWS, COLS)
-    for route in reply.routes:
-        if route.status is RouteStatus.UNREACHABLE:
-            assert math.isinf(best[route.start])
-            continue
-        assert walk(GRID, route.start, route.directions)[-1] == target
-        assert route.cost_s == pytest.approx(driven_s(pace, route), rel=1e-5)
-        assert route.cost_s == pytest.approx(best[route.start], rel=1e-5)
-        assert route.lower_bound_s <= best[route.start] * (1 + 1e-6)
 
 
 def test_one_wildcard_question_brings_the_costs_of_all_planners() -> None:
@@ -126,40 +104,6 @@ def test_after_a_reconnect_every_follower_is_pushed_its_route_as_one_before_may_
     assert (pushed.vehicle, pushed.route.directions) == ("a", route.directions)
 
 
-def test_a_planner_killed_under_way_serves_again_within_three_seconds_with_all_marks() -> None:
-    swarm = Swarm()
-    swarm.keeper("keeper", KeeperStore(":memory:"))
-    swarm.cells["t"] = GRID.cell(20, 40)
-    swarm.mark(*(GRID.cell(row, 25) for row in range(ROWS - 1)))
-    swarm.run(1.5)
-    swarm.kill("planner-t-1")
-    swarm.run(0.3)
-    assert swarm.ear.ask(ROUTE, RouteRequest(cells=[0]), target="t") == []
-    swarm.planner("t", incarnation=2)
-    swarm.run(0.4)
-    reply = swarm.ear.routes(GRID.cell(20, 10))
-    assert reply.incarnation == 2
-    assert GRID.cell(ROWS - 1, 25) in walk(GRID, reply.routes[0].start, reply.routes[0].directions)
-
-
-def test_gaps_are_measured_over_those_who_follow() -> None:
-    swarm = Swarm(rough(8))
-    chance = random.Random(1)
-    homes = [GRID.cell(20, col) for col in (0, 5, 45)]
-    for n in range(60):
-        swarm.cells["t"] = GRID.cell(20, 20 + (n // 3) % 10)
-        swarm.report(*((f"v{i}", home) for i, home in enumerate(homes)))
-        swarm.run(0.1)
-        if chance.random() < 0.1:
-            swarm.ear.routes(homes[0], vehicles=["v0"])
-    status = swarm.ear.of(PlannerStatus)[-1]
-    assert status.following == 3
-    assert 1.0 <= status.gap_mean <= status.gap_max < 1.0001
-    stats = swarm.ear.last_stats()
-    for name in ("gap_excess", "certified_gap_excess", "growth_ms"):
-        assert sum(stats.histograms[name].values()) > 0, name
-
-
 def test_windows_and_the_exact_trees_that_renew_them_are_counted() -> None:
     swarm = Swarm(rough(9), "auto", cpu_budget=RENEWS)
     for n in range(60):
@@ -170,7 +114,9 @@ def test_windows_and_the_exact_trees_that_renew_them_are_counted() -> None:
     assert stats.counts["growths"] > 5
     assert stats.counts["window_growths"] > 10
     assert sum(stats.histograms["window_ms"].values()) == stats.counts["window_growths"]
-    assert swarm.ear.of(PlannerStatus)[-1].gap_max >= 1.0
+    status = swarm.ear.of(PlannerStatus)[-1]
+    assert status.following == 1
+    assert 1.0 <= status.gap_mean <= status.gap_max
 
 
 def test_the_largest_answer_fits_into_one_message_with_its_routes_cut() -> None:

@@ -42,14 +42,6 @@ def test_routes_are_driven_as_they_say_and_their_bounds_hold_while_target_and_ma
                 assert math.isinf(optimum[row, start])
 
 
-def test_cost_to_go_is_that_of_an_independent_dijkstra() -> None:
-    pace = random_pace(np.random.default_rng(6), 20, 30, 8.0, 0.2)
-    target = np.argwhere(np.isfinite(pace))[50]
-    finder = RouteFinder(pace, target=(int(target[0]), int(target[1])))
-    expected = slow_twins.cost_to_go(pace, int(target[0]) * 30 + int(target[1]))
-    np.testing.assert_allclose(finder.cost_to_go_s(), expected, rtol=1e-5)
-
-
 def test_every_cell_has_an_answer_and_none_ends_the_interpreter() -> None:
     pace = np.ones((6, 7), np.float32)
     pace[2, 2] = np.inf

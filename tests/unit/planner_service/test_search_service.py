@@ -87,28 +87,6 @@ def test_vehicles_of_different_classes_search_by_one_belief_each_on_its_own_grou
     assert math.hypot(rows[1] - rows[0], cols[1] - cols[0]) * world.ground.grid.resolution_m > 120.0
 
 
-def test_a_planner_that_begins_again_searches_from_an_earlier_sighting_that_it_is_told_again() -> None:
-    world = World()
-    world.run(7)
-    search = world.service._planner.target_search
-    belief = search.searcher.belief
-    assert (belief.reachable == belief.blocks.open).all(), "nothing is known yet"
-    free = np.flatnonzero(np.isfinite(world.ground.pace_s_per_m))
-    cell = int(free[len(free) // 2])
-    for author, age_s, where in (
-        ("all.a1.1", 200, int(free[0])),
-        ("all.a0.1", 40, cell),
-        ("all.a2.1", 40, 48 * 48),
-    ):
-        world.sight(author, age_s, where)
-    world.run(1)
-    belief = search.searcher.belief
-    assert search.active
-    assert belief.elapsed_s >= 40.0
-    assert belief.reachable[belief.blocks.of_cell(cell)]
-    assert belief.reachable.sum() < belief.blocks.open.sum()
-
-
 def test_a_planner_tells_what_it_believes_while_it_searches_and_once_that_it_does_no_more() -> None:
     world = World()
     heard: list[Believed] = []

@@ -4,6 +4,7 @@ import multiprocessing
 from pathlib import Path
 
 import numpy as np
+import psutil
 import pytest
 
 from shared_map.array_files import CellsOf, open_array, private_copy, save_array
@@ -57,14 +58,10 @@ def test_a_private_copy_takes_memory_only_where_it_is_written_to(tmp_path: Path)
 
 def _anonymous_kib(array: np.ndarray) -> int:
     """Memory of the mapping that an array lies in which belongs to this process alone."""
-    address, inside = array.ctypes.data, False
-    for line in Path("/proc/self/smaps").read_text().splitlines():
-        head = line.split()[0]
-        if "-" in head and not head.endswith(":"):
-            first, end = (int(part, 16) for part in head.split("-"))
-            inside = first <= address < end
-        elif inside and head == "Anonymous:":
-            return int(line.split()[1])
+    for each in psutil.Process().memory_maps(grouped=False):
+        first, end = (int(part, 16) for part in each.addr.split("-"))
+        if first <= array.ctypes.data < end:
+            return int(each.anonymous) >> 10
     raise AssertionError("no such mapping")
 
 

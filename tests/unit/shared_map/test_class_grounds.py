@@ -74,6 +74,7 @@ def test_what_is_prepared_is_what_would_be_made(tmp_path, directional, monkeypat
             assert np.array_equal(*same, equal_nan=True)
         assert ground.terrain.digest == made[name].terrain.digest
         assert ground.terrain.least_s_per_m == made[name].terrain.least_s_per_m
+        assert ground.terrain.vehicle_radius_m == made[name].terrain.vehicle_radius_m
         assert (ground.terrain.climb is None) == (directional == "false")
     assert class_terrains(scenario, again)["walker"] is found["walker"].terrain
     assert class_truths(scenario, again, truth_again)["walker"] is found["walker"].truth

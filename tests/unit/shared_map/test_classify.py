@@ -99,24 +99,6 @@ def test_a_painted_landscape_is_recognised(tmp_path: Path) -> None:
     assert (found == classes)[sure].mean() > 0.6
 
 
-def test_a_class_that_hangs_on_the_exposure_is_unknown() -> None:
-    level = np.zeros((40, 60), np.float32)
-    photo = np.full((40, 60, 3), (96, 128, 70), np.uint8)
-    photo[:, :30] = (70, 88, 60)  # between the greens of forest and of meadow
-    found = by_rules(photo, level, 10.0)
-    assert (found[:, 35:] == TerrainClass.GRASS).all()
-    assert (found[:, :25] == TerrainClass.UNKNOWN).all()
-
-
-def test_a_bright_beach_is_no_snow() -> None:
-    level = np.zeros((60, 60), np.float32)
-    photo = np.full((60, 60, 3), (120, 140, 80), np.uint8)
-    photo[:, 30:33] = 250
-    assert not (by_rules(photo, level, 30.0)[:, 31] == TerrainClass.SNOW).any()
-    photo[:] = 250
-    assert (by_rules(photo, level, 30.0) == TerrainClass.SNOW).all()
-
-
 def test_a_white_cloud_and_its_shadow_on_a_slope_are_no_water() -> None:
     row, _ = np.mgrid[:80, :80]
     elevation_m = (row * 6.0).astype(np.float32)

@@ -8,7 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from support.effort import few
 from support.map_strategies import AUTHORS, GRID, ZONES, Composite, held_winners, mark_sets, naive_winners, set_of
-from support.swarm_model import LossyLinks, SwarmModel
+from support.swarm_model import SwarmModel
 
 from shared_map.keeper.compaction import CompactionPlan, compact
 from shared_map.keeper.mark_store import KeeperStore
@@ -237,29 +237,6 @@ def test_a_tile_is_due_when_an_author_dies_or_is_alive_after_all_or_an_earlier_o
 
 
 # --- services -----------------------------------------------------------------------------------------------
-
-
-def test_an_author_that_was_only_cut_off_says_all_again() -> None:
-    links = LossyLinks(1)
-    swarm = SwarmModel(links)
-    swarm.scenario = Scenario(map=MapConfig(compact_after_s=5))
-    keeper = swarm.keeper("keeper", KeeperStore(":memory:"))
-    cut_off, other = swarm.writer("a1.1"), swarm.writer("b1.1")
-    swarm.run(2)
-    cut_off.sync.publish(cut_off.replica.write([5, 6], LETHAL, 0.0, swarm.now_ns))
-    swarm.run(1)
-    other.sync.publish(other.replica.write([5], CLEAR, 0.0, swarm.now_ns))
-    swarm.run(1)
-    swarm.kill("b1.1")
-    links.far_side = {"a1.1"}
-    swarm.run(20)
-    assert keeper.replica.held.capacity.marks == 2  # of three
-    links.far_side = set()
-    cut_off.sync.publish(cut_off.replica.write([7], LETHAL, 0.0, swarm.now_ns))
-    swarm.run(5)
-    assert held_winners(keeper.replica) == held_winners(cut_off.replica)
-    assert {cell for _, cell in held_winners(keeper.replica)} == {5, 6, 7}
-    assert keeper.replica.held.fingerprint() == cut_off.replica.held.fingerprint()
 
 
 def test_a_full_disk_compacts_nothing_and_a_store_grows_no_more_than_the_ground() -> None:

@@ -128,12 +128,6 @@ def test_a_keeper_refuses_a_store_whose_marks_for_one_class_would_be_for_another
         SwarmModel(terrain=terrain, scenario=scenario).keeper("keeper", store)
 
 
-def test_a_store_in_use_is_refused(tmp_path: Path) -> None:
-    with KeeperStore(tmp_path / "map.sqlite"), pytest.raises(StoreError, match="in use by another keeper"):
-        KeeperStore(tmp_path / "map.sqlite")
-    KeeperStore(tmp_path / "map.sqlite").close()
-
-
 def test_a_store_can_be_read_while_a_keeper_writes_it(tmp_path: Path) -> None:
     with KeeperStore(tmp_path / "a map.sqlite") as store:
         store.save(some_sets(2))
@@ -198,16 +192,6 @@ def test_a_store_without_a_witness_gets_one_when_it_is_opened(tmp_path: Path) ->
         KeeperStore(path)
     lock.unlink()
     KeeperStore(path).close()
-
-
-def test_damage_that_comes_up_while_a_keeper_runs_is_noticed_at_the_row(tmp_path: Path) -> None:
-    path = tmp_path / "map.sqlite"
-    with KeeperStore(path) as store:
-        store.save(some_sets())
-        with sqlite3.connect(path) as db:
-            db.execute("UPDATE sets SET seq = seq + 1 WHERE tile = 3")
-        with pytest.raises(DamagedError, match="row 3, 'a' of table sets"):
-            list(store.load())
 
 
 def test_a_folder_that_cannot_be_written_is_told_of(tmp_path: Path) -> None:

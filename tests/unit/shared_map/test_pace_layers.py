@@ -76,19 +76,6 @@ def test_a_void_counts_as_level_with_its_neighbours_and_spoils_none() -> None:
     np.testing.assert_allclose(north[0:3], -0.2, atol=1e-6)
 
 
-@pytest.mark.parametrize("rule", RULES)
-def test_level_ground_costs_one_and_steeper_never_less(rule: str) -> None:
-    cost = CostConfig(slope_rule=rule, slope_table=POINTS if rule == "table" else (), max_slope_deg=35)
-    grades = np.tan(np.radians(np.linspace(0, 40, 200))).astype(np.float32)
-    factor = slope_factor(grades, cost)
-    assert factor[0] == pytest.approx(1.0, abs=1e-6) or rule == "tobler"
-    # Langmuir takes ten minutes off from 5 degrees on, all at once.
-    assert (np.diff(factor[np.isfinite(factor)]) >= -1e-6).all() or rule == "naismith_langmuir"
-    steep = np.linspace(0, 40, 200) > 35.001
-    assert np.isinf(factor[steep]).all()
-    assert np.isfinite(factor[np.linspace(0, 40, 200) < 34.999]).all()
-
-
 def test_linear_and_quadratic_reach_the_steep_factor_at_the_limit() -> None:
     limit = np.array([math.tan(math.radians(29.999))], np.float32)
     half = np.array([math.tan(math.asin(math.sin(math.radians(30)) / 2))], np.float32)

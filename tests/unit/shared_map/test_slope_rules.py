@@ -3,6 +3,7 @@ others."""
 
 import math
 from pathlib import Path
+from typing import get_args
 
 import numpy as np
 import pytest
@@ -19,9 +20,11 @@ from shared_map.terrain.slope_and_climb import (
     directional_factor,
     slope_factor,
 )
+from shared_map.terrain.synthetic import mountain_noise
 from shared_map.terrain.terrain import build_terrain
 from swarm.config.contradictions import cost_faults
 from swarm.config.ground import CostConfig
+from swarm.config.scenario import Strategy
 from swarm.config.scenario_files import load_scenario, parse_scenario
 from swarm.config.vehicle_classes import PRESETS, cost_of_preset
 from swarm.errors import ConfigError
@@ -161,6 +164,38 @@ def test_a_step_of_just_the_limit_is_allowed_and_a_hair_more_is_not() -> None:
             climb = climb_on(np.array([[0.0, rise_m * share]]), cost)
             assert climb.allows(0, 1) == climb.allows(1, 0) == allowed
     assert "none is steeper than 60 degrees up or 60 degrees down" in climb.note
+
+
+def test_a_step_beside_a_void_is_level() -> None:
+    heights = np.tile(np.arange(12.0), (3, 1))
+    heights[1, 5] = np.nan
+    climb = climb_on(heights, ruled("energy", directional=True))
+    assert climb.of_step(16, 17) == climb.of_step(17, 18) == 1.0
+    np.testing.assert_array_equal(climb.along(np.array([16, 17]), np.array([17, 18])), 1.0)
+
+
+def test_one_step_and_many_steps_read_the_same_table() -> None:
+    heights = mountain_noise(np.random.default_rng(4), 30, 40, 10.0).whole() * 60
+    climb = climb_on(heights, ruled("tobler", directional=True))
+    pairs = [(cell, other) for cell in range(0, 1200, 7) for _, other in climb.grid.neighbours(cell)]
+    tails, heads = np.array(pairs).T
+    alone = np.array([climb.of_step(tail, head) for tail, head in pairs])
+    np.testing.assert_array_equal(climb.along(tails, heads), alone.astype(np.float32))
+
+
+def test_the_paces_of_a_directional_terrain_are_those_of_level_ground() -> None:
+    text = '[terrain]\nsource = "synthetic"\nrows = 48\ncols = 64\n[cost]\ndirectional = true\nclasses = false\n'
+    terrain = build_terrain(parse_scenario(text))
+    np.testing.assert_allclose(terrain.pace_s_per_m[~terrain.lethal], 0.1)
+    assert any("level ground" in note for note in terrain.notes)
+    assert build_terrain(parse_scenario(f'{text}slope_rule = "tobler"')).digest != terrain.digest
+
+
+def test_every_strategy_goes_with_direction_and_a_price_of_length_does_not() -> None:
+    for strategy in get_args(Strategy):
+        parse_scenario(f'[cost]\ndirectional = true\n[planner]\nstrategy = "{strategy}"')
+    with pytest.raises(ConfigError, match="leave it out"):
+        parse_scenario("[cost]\ndirectional = true\n[planner]\nlength_weight = 0.1")
 
 
 def test_a_terrain_says_its_rule_and_its_preset() -> None:

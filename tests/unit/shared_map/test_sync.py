@@ -79,23 +79,6 @@ def test_a_keeper_answers_for_all_authors_and_an_agent_for_itself(swarm: SwarmMo
         assert sorted(event.message.author for event in events if isinstance(event, Replied)) == authors  # type: ignore[attr-defined]
 
 
-def test_a_lost_set_is_fetched_after_the_next_digest_and_nothing_else_is() -> None:
-    links = LossyLinks(1)
-    swarm = SwarmModel(links)
-    author, listener = swarm.writer("a1.1"), swarm.listener("p")
-    write(author, swarm, [5])
-    swarm.run(0.5)
-    links.dropped = 1.0
-    known = listener.replica.counts["sets_repeated"]
-    write(author, swarm, [40])  # another tile
-    swarm.run(0.2)
-    links.dropped = 0.0
-    assert not hold_the_same([author, listener])
-    swarm.run(1.5)
-    assert hold_the_same([author, listener])
-    assert listener.replica.counts["sets_repeated"] == known
-
-
 @pytest.mark.parametrize("part_bytes", [200, replica_sync._PART_BYTES])
 def test_what_the_keeper_missed_of_the_dead_is_given_to_it_by_those_that_heard_it(part_bytes, monkeypatch):
     """The keeper's digest goes out whole, or in parts of three rows."""

@@ -14,13 +14,8 @@ from support.height_models import written
 
 from shared_map.terrain.pace_layers import TerrainClass
 from shared_map.terrain.store import (
-    load_beside,
-    load_prepared,
-    load_terrain,
-    load_truth,
     prepare,
     save_prepared,
-    scenario_key,
 )
 from shared_map.terrain.synthetic import Noise, fractal_noise, mountain_noise
 from shared_map.terrain.terrain import Terrain, any_in_blocks, build_terrain, level_of, terrain_of_pace
@@ -29,7 +24,6 @@ from swarm.config.ground import CostConfig, HiddenConfig, TerrainConfig, ZoneCon
 from swarm.config.scenario import Scenario
 from swarm.config.scenario_files import load_scenario
 from swarm.errors import ConfigError, StoreError, TerrainError
-from swarm.runtime.role_setup import RoleSetup
 
 SCENARIOS = Path(__file__).parents[3] / "launch_scripts" / "scenarios"
 SMALL = Scenario(seed=2, terrain=TerrainConfig(source="synthetic", rows=48, cols=64, relief_m=150))
@@ -64,29 +58,6 @@ def test_the_same_scenario_gives_the_same_digest_and_another_rule_another() -> N
     assert build_terrain(SMALL).digest == digest
     assert build_terrain(with_cost(steep_factor=7.0)).digest != digest
     assert build_terrain(msgspec.structs.replace(SMALL, seed=3)).digest != digest
-
-
-def test_a_prepared_terrain_is_the_same(tmp_path: Path) -> None:
-    scenario = with_cost(vehicle_radius_m=40.0)
-    terrain, truth = prepare(tmp_path / "run", scenario)
-    again = load_prepared(tmp_path / "run", scenario_key(scenario))
-    assert (again.grid, again.digest, again.notes) == (terrain.grid, terrain.digest, terrain.notes)
-    for name in ("elevation_m", "photo", "pace_s_per_m", "ground_s_per_m", "classes"):
-        np.testing.assert_array_equal(getattr(again, name), getattr(terrain, name))
-    np.testing.assert_array_equal(load_beside(tmp_path / "run", "truth"), truth)
-    assert again.vehicle_radius_m == 40.0
-    assert (terrain.ground_s_per_m != terrain.pace_s_per_m).any()
-
-
-def test_a_prepared_terrain_of_another_scenario_is_not_taken(tmp_path: Path) -> None:
-    prepare(tmp_path, SMALL)
-    other = msgspec.structs.replace(SMALL, seed=9)
-    setup = RoleSetup(other, "r", "agent", "a0", 1, 1, tmp_path)
-    assert load_prepared(tmp_path, scenario_key(other)) is None
-    terrain = load_terrain(setup)
-    assert terrain.digest == build_terrain(other).digest
-    assert load_truth(setup, terrain).shape == (48, 64)
-    assert load_prepared(tmp_path / "nowhere") is None
 
 
 def test_a_folder_that_cannot_be_written_is_said(tmp_path: Path) -> None:

@@ -307,6 +307,9 @@ def test_values_that_the_scenario_names_are_voids(tmp_path: Path) -> None:
     assert np.isnan(source.elevation_m[20:40, 20:40]).all()
 
 
+# --- patches of equal height ----------------------------------------------------------------------------------
+
+
 def test_a_text_grid_is_looked_at_alike(tmp_path: Path) -> None:
     ground = np.maximum(hills(12, 900) - 300, 0)
     ground[:3] = -9998
@@ -316,9 +319,6 @@ def test_a_text_grid_is_looked_at_alike(tmp_path: Path) -> None:
     source = load(tmp_path / "a.asc", resolution_m=30.0)
     assert np.isnan(source.elevation_m[0]).all()
     assert is_water(source).mean() == pytest.approx((ground == 0).mean(), abs=0.03)
-
-
-# --- patches of equal height ----------------------------------------------------------------------------------
 
 
 def stairs(seed: int, rows: int, cols: int, steps: float) -> np.ndarray:

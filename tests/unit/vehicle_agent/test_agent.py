@@ -20,7 +20,8 @@ from swarm.config.scenario_files import parse_scenario
 from swarm.grid import GridSpec
 from swarm.right_of_way.shards import Shards
 from swarm.wire.fields import column
-from swarm.wire.route_columns import RouteBatch
+from swarm.wire.messages.vehicles import VehicleState
+from swarm.wire.route_columns import Route, RouteBatch, RouteStatus
 from vehicle_agent.agent import Agent, AskRoutes
 from vehicle_agent.agent_maps import LocalMap
 from vehicle_agent.driving.driven_vehicle import Places, Vehicle
@@ -69,11 +70,6 @@ def answer_costs(agent: Agent, asked: AskCosts, now_ns: int, **costs_s: list[flo
     agent.costs_ended(asked.request, now_ns)
 
 
-def test_at_the_start_all_planners_are_asked_once_for_all_vehicles(agent: Agent) -> None:
-    assert agent.decide(0) == [AskCosts(1, ("a0-00", "a0-01"), (GRID.cell(5, 5), GRID.cell(5, 7)))]
-    assert agent.decide(S // 10) == []
-
-
 def test_one_request_per_target_and_tick_for_all_who_need_a_route(agent):
     (asked,) = agent.decide(0)
     assert isinstance(asked, AskCosts)
@@ -82,7 +78,11 @@ def test_one_request_per_target_and_tick_for_all_who_need_a_route(agent):
     cells = (GRID.cell(5, 5), GRID.cell(5, 7))
     assert routes == AskRoutes(2, "t0", ("a0-00", "a0-01"), cells, force=False, reroutes=0)
     assert agent.routes_given(routes.request, route_reply(RouteBatch.of([]), GRID), S // 5) == []
-    assert len(agent.decide(S)) == 1
+    (again,) = agent.decide(S)
+    ended = RouteBatch.of([Route(status=RouteStatus.OK, start=cell, cost_s=0.0) for cell in cells])
+    agent.routes_given(again.request, route_reply(ended, GRID), S)
+    (forced,) = agent.decide(2 * S)
+    assert (again.force, forced.force, forced.reroutes) == (False, True, 2), "their routes have run out"
 
 
 def test_a_vehicle_that_finds_its_place_after_the_others_is_assigned_soon() -> None:
@@ -115,6 +115,16 @@ def test_once_all_living_planners_have_answered_the_end_of_a_question_is_not_wai
     assert agent.costs_given(asked.request, "t0", costs_s)
 
 
+def test_vehicles_whose_planner_is_gone_are_lost_and_ask_the_one_that_comes_after_it(agent: Agent) -> None:
+    (asked,) = agent.decide(0)
+    answer_costs(agent, asked, 0, t0=[5.0, 6.0], t1=[math.inf, math.inf])
+    agent.set_planners({"t1": 1}, S)
+    assert {vehicle.state for vehicle in agent.vehicles.values()} == {VehicleState.LOST}
+    agent.set_planners({"t0": 2, "t1": 1}, 2 * S)
+    (routes,) = [each for each in agent.decide(3 * S) if isinstance(each, AskRoutes)]
+    assert (routes.target, routes.vehicles) == ("t0", ("a0-00", "a0-01"))
+
+
 def test_who_gets_no_costs_that_count_asks_again_soon(agent: Agent) -> None:
     """Not those of the wrong length, or of another request."""
     (asked,) = agent.decide(0)
@@ -132,22 +142,6 @@ def close(agent: Agent, cell: int, now_ns: int) -> None:
     agent._steering._pace = agent._map.pace.reshape(-1)
     agent._steering._pace[cell] = np.inf
     agent.map_changed([GRID.window], now_ns)
-
-
-def test_a_vehicle_drives_what_it_is_granted_and_gives_back_what_is_found_lethal() -> None:
-    agent = agent_of(parse_scenario(TEXT))
-    here = GRID.cell(5, 5)
-    grant(agent, 1, v0=[here], v1=[GRID.cell(8, 8)])
-    grant(agent, 2, v0=[here, here + 1, here + 2, here + 3], v1=[GRID.cell(8, 8)])
-    agent.begin_drive(0)
-    agent.begin_drive(S // 2)
-    while agent.drive() is not None:
-        pass
-    assert agent.vehicles["a0-00"].motion.head == here + 1
-    close(agent, here + 2, S)
-    assert here + 2 not in agent.holdings.path("a0-00")
-    assert agent.holdings.path("a0-00")[-1] == here + 1
-    assert [vehicle.cell for vehicle in agent.vehicles.values()][1] == GRID.cell(8, 8)
 
 
 @pytest.mark.parametrize("beside", [GRID.cell(5, 6), GRID.cell(6, 5)])

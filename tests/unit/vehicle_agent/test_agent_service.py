@@ -20,9 +20,6 @@ def test_vehicles_drive_to_the_target_and_arrive_as_soon_as_the_pace_allows() ->
     assert world.where() == {"a0-00": (10, 11)}
 
 
-# --- driving ------------------------------------------------------------------------------------------------
-
-
 def test_a_vehicle_that_finds_the_road_closed_marks_it_and_takes_another() -> None:
     prior = [
         "###############",
@@ -37,7 +34,7 @@ def test_a_vehicle_that_finds_the_road_closed_marks_it_and_takes_another() -> No
     world.arrive(60)
     assert world.count("marks") == 1
     assert world.count("reroute_requests") >= 1
-    assert not np.isfinite(world.planners["t"].pace[1, 7])
+    assert np.isinf(world.agents["a0"]._maps.common.ground_s_per_m[1, 7])
 
 
 def test_a_vehicle_that_an_obstacle_shuts_in_raises_an_alarm_until_the_obstacle_leaves() -> None:
@@ -119,38 +116,6 @@ def test_routes_given_in_parts_are_driven_without_a_stop() -> None:
     assert world.count("reroute_requests") == 0
 
 
-def test_nothing_is_ever_forced_until_a_route_has_run_out() -> None:
-    world = AgentWorld(scenario(1, [(10, 2)]), pace_of(OPEN)).begin(t=(10, 12))
-    world.run(3.0)
-    planner = world.planners["t"]
-    assert [request.force for request in planner.requests] == [False]
-    assert planner.requests[0].vehicles == ["a0-00"]
-    # The target walks away and no planner pushes a newer route: the old one runs out.
-    world.put_target("t", 2, 2)
-    world.arrive(60)
-    assert any(request.force for request in planner.requests)
-    assert world.count("reroute_requests") >= 1
-
-
-# --- which target -------------------------------------------------------------------------------------------
-
-TWO_TARGETS = scenario(1, [(10, 10)]).replace('name = "t"\n', 'name = "t"\ncount = 2\n')
-
-
-def test_each_vehicle_goes_for_the_cheapest_target_and_changes_only_for_a_better_one() -> None:
-    world = AgentWorld(TWO_TARGETS, pace_of(["." * 40] * 20)).begin(t0=(10, 25), t1=(10, 0))
-    world.run(1.0)
-    vehicle = world.agents["a0"].agent.vehicles["a0-00"]
-    assert vehicle.target == "t1"
-    world.put_target("t0", 10, 17)
-    world.put_target("t1", 19, 4)
-    world.run(6.0)
-    assert vehicle.target == "t1"
-    world.put_target("t0", *world.where()["a0-00"])
-    world.arrive(20)
-    assert vehicle.target == "t0"
-
-
 def test_a_walled_in_vehicle_is_stranded_until_the_wall_is_known_to_be_open() -> None:
     prior = ["." * 12] * 3 + ["#" * 12] + ["." * 12] * 4
     world = AgentWorld(scenario(1, [(1, 1)]), pace_of(prior)).begin(t=(6, 6))
@@ -159,44 +124,6 @@ def test_a_walled_in_vehicle_is_stranded_until_the_wall_is_known_to_be_open() ->
     assert world.agents["a0"].counters.gauges["stranded"] == 1.0
     world.put_target("t", 1, 8)
     world.arrive(20)
-
-
-# --- planners come and go -----------------------------------------------------------------------------------
-
-
-def test_a_vehicle_whose_planner_is_gone_keeps_its_route_and_says_so() -> None:
-    world = AgentWorld(scenario(1, [(10, 1)]), pace_of(OPEN)).begin(t=(10, 15))
-    world.run(3.0)
-    world.planners.pop("t").bus.close()
-    world.run(0.5)
-    assert world.all_in(VehicleState.LOST)
-    before = world.where()["a0-00"][1]
-    world.run(3.0)
-    assert world.all_in(VehicleState.LOST)
-    assert world.where()["a0-00"][1] - before == 3
-    world.start_planner("t", incarnation=2)
-    world.run(1.0)
-    assert world.all_in(VehicleState.FOLLOWING)
-    assert world.planners["t"].requests[0].vehicles == ["a0-00"]
-    world.arrive(20)
-
-
-# --- crashes and bad links ----------------------------------------------------------------------------------
-
-
-def test_a_restarted_agent_goes_on_where_its_vehicles_last_stood() -> None:
-    world = AgentWorld(scenario(4), pace_of(OPEN)).begin(t=(10, 10))
-    world.run(4.0)
-    before = world.where()
-    world.crash_agent("a1")
-    world.run(1.5)
-    world.start_agent("a1")
-    world.until(lambda: len(world.agents["a1"].agent.vehicles) == 2, within_s=0.6)
-    after = world.where()
-    for id in ("a1-00", "a1-01"):
-        assert max(abs(a - b) for a, b in zip(after[id], before[id], strict=True)) <= 1
-    world.until(lambda: len(world.states()) == 4 and VehicleState.IDLE not in world.states().values(), within_s=3)
-    world.assert_lawful()
 
 
 def test_the_first_to_start_does_not_wait_for_anybody() -> None:
@@ -229,3 +156,49 @@ def test_an_agent_that_cannot_start_is_refused_in_a_sentence(text: str, picture:
     world = AgentWorld(text, pace_of(picture))
     with pytest.raises(ConfigError, match=words):
         world.start_agent(agent)
+
+
+# --- crowds and corridors, in which they make way for each other ----------------------------------------------
+
+TWO_WAYS = """
+seed = {seed}
+targets = [{{ name = "west", walk = "still" }}, {{ name = "east", walk = "still" }}]
+groups = [
+    {{ name = "eastbound", vehicles = {count}, cells = {west_cells}, targets = ["east"] }},
+    {{ name = "westbound", vehicles = {count}, cells = {east_cells}, targets = ["west"] }},
+]
+vehicles = {{ per_agent = {per_agent}, sense_range_m = 30.0, capture_range_m = {capture} }}
+"""
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_a_corridor_with_one_passing_place_lets_two_pass_each_other(seed: int) -> None:
+    corridor = ["#" * 21, "#" + "." * 19 + "#", "#" * 10 + "." + "#" * 10, "#" * 21]
+    text = TWO_WAYS.format(seed=seed, count=1, west_cells=[[1, 2]], east_cells=[[1, 16]], per_agent=1, capture=10.0)
+    world = AgentWorld(text, pace_of(corridor)).begin(west=(1, 1), east=(1, 19))
+    world.arrive(120)
+
+
+@pytest.mark.seeds(1)
+def test_two_columns_pass_each_other_through_a_gap(seed: int) -> None:
+    field = ["." * 9 + ("..." if row == 4 else "###") + "." * 9 for row in range(9)]
+    west = [[row, col] for col in (1, 3) for row in (2, 4, 6)]
+    east = [[row, 20 - col] for row, col in west]
+    text = TWO_WAYS.format(seed=seed, count=6, west_cells=west, east_cells=east, per_agent=3, capture=25.0)
+    world = AgentWorld(text, pace_of(field)).begin(west=(4, 2), east=(4, 18))
+    world.arrive(300)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_a_crowd_fits_around_its_target(seed: int) -> None:
+    # 21 cells lie within 25 m of the target: room for all 16, if those in front move up.
+    text = scenario(16, per_agent=4, capture=25.0).replace("seed = 3", f"seed = {seed}")
+    world = AgentWorld(text, pace_of(OPEN)).begin(t=(10, 10))
+    world.arrive(120)
+
+
+def test_a_vehicle_that_has_arrived_in_a_corridor_moves_up_for_those_behind() -> None:
+    corridor = ["#" * 16, "#" + "." * 14 + "#", "#" * 16]
+    text = scenario(3, [(1, 5), (1, 3), (1, 1)], per_agent=1, capture=30.0)
+    world = AgentWorld(text, pace_of(corridor)).begin(t=(1, 12))
+    world.arrive(60)

@@ -381,8 +381,6 @@ def told(author: str, cost_s: float, stamp_ns: int) -> SharedCosts:
 @pytest.mark.parametrize(
     ("changes", "found"),
     [
-        ({"costs_s": pack_column([math.nan], "<f4")}, "costs_s"),
-        ({"costs_s": pack_column([-1.0], "<f4")}, "costs_s"),
         ({"costs_s": pack_column([1.0, 2.0], "<f4")}, "costs_s has 8 bytes"),
         ({"ids": ["a2-00"]}, "none of agent a1"),
         ({"ids": ["a1-00", "a1-00"], "costs_s": pack_column([1, 1], "<f4"), "targets": bytes(2)}, "twice"),

@@ -3,15 +3,13 @@
 import random
 from collections.abc import Sequence
 
-import pytest
-
 from planner_service.followers import Followers
 from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec
 from swarm.wire.fields import column
 from swarm.wire.messages.vehicles import Chasers
 from vehicle_agent.driving.driven_vehicle import goal_name
-from vehicle_agent.position_reports import HEARTBEAT_NS, ChasersReport
+from vehicle_agent.position_reports import ChasersReport
 
 TICK_NS = NS_PER_S // 10
 GRID = GridSpec(rows=64, cols=64, resolution_m=10.0)
@@ -28,21 +26,6 @@ def told(report: ChasersReport, *vehicles: Chasing, at_ns: int = 0) -> dict[str,
 def test_a_vehicle_tells_the_end_of_its_path_where_a_new_route_for_it_begins() -> None:
     vehicles: list[Chasing] = [("v", "t0", (4, 5, 6)), ("w", "t1", (9,)), ("x", None, (20, 21)), ("y", "t0", ())]
     assert told(ChasersReport("all.a0.1"), *vehicles) == {"t0": {"v": 6}, "t1": {"w": 9}}
-
-
-@pytest.mark.parametrize(
-    ("now", "at_once", "later"),
-    [
-        (("v", "t0", (6, 7, 8)), {}, {"t0": {"v": 8}}),  # it has not driven past the cell told
-        (("v", "t0", (7, 8)), {"t0": {"v": 8}}, {}),
-        (("v", "t1", (6,)), {"t0": {}, "t1": {"v": 6}}, {}),  # an empty target is told once
-    ],
-)
-def test_who_drives_past_the_cell_told_or_leaves_its_target_is_told_at_once(now, at_once, later):
-    report = ChasersReport("a0.1")
-    told(report, ("v", "t0", (4, 5, 6)))
-    assert told(report, now, at_ns=TICK_NS) == at_once
-    assert told(report, now, at_ns=HEARTBEAT_NS) == later
 
 
 def test_a_vehicle_that_is_sent_elsewhere_tells_its_new_place_at_once() -> None:

@@ -52,13 +52,6 @@ def drive(dynamics: PluginDynamics, motion: Motion, path: list[int], ticks: int)
     return places
 
 
-def test_a_vehicle_keeps_the_speed_that_it_is_told() -> None:
-    dynamics, told, _ = driven_by(lambda stretch: 4.0)
-    places = drive(dynamics, Motion(GRID, 0), list(range(20)), 100)
-    assert places[-1] == pytest.approx(5.0 + 4.0 * 10.0)
-    assert not told
-
-
 def test_a_vehicle_speeds_up_tick_by_tick_however_many_stretches_a_tick_has() -> None:
     dynamics, _, asked = driven_by(lambda stretch: stretch.speed_m_per_s + 2.0 * stretch.tick_s)
     places = drive(dynamics, Motion(GRID, 0), list(range(30)), 40)

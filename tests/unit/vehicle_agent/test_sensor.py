@@ -41,15 +41,6 @@ def test_what_agrees_with_the_map_is_not_marked() -> None:
     assert len(compare(sight, LEVEL, LEVEL)) == 0
 
 
-def test_lethal_slow_and_cleared_cells_are_marked_as_such() -> None:
-    truth = changed({41: math.inf, 42: 0.3})
-    ground = changed({31: math.inf, 39: 0.5})
-    findings = compare(TruthSensor(GRID, truth, 20.0).look([CENTRE]), ground, LEVEL)
-    assert findings.cells.tolist() == [31, 39, 41, 42]
-    assert findings.kinds.tolist() == [MarkKind.CLEAR, MarkKind.CLEAR, MarkKind.LETHAL, MarkKind.PACE]
-    assert findings.paces[3] == np.float32(0.3)
-
-
 def test_a_cell_that_two_vehicles_see_is_marked_once() -> None:
     truth = changed({41: math.inf})
     findings = compare(TruthSensor(GRID, truth, 20.0).look([40, 42]), LEVEL, LEVEL)

@@ -1,9 +1,11 @@
-"""One vehicle: what it asks for and its state, whatever happens."""
+"""One vehicle: what it asks for and its state, whatever happens; and its route on the way."""
 
+import contextlib
 import random
 from collections.abc import Callable
 from itertools import pairwise
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -12,8 +14,8 @@ from support.vehicle_states import record, table
 from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec, walk
 from swarm.wire.messages.vehicles import Followed, VehicleState
-from swarm.wire.route_columns import RouteStatus
-from vehicle_agent.driving.driven_vehicle import GivenRoute, Reason, Vehicle
+from swarm.wire.route_columns import RouteStatus, directions_of
+from vehicle_agent.driving.driven_vehicle import Follower, GivenRoute, Reason, Vehicle
 
 GRID = GridSpec(10, 10, 10.0)
 S = NS_PER_S
@@ -121,13 +123,6 @@ def test_no_way_to_its_target_leaves_it_stranded_and_it_tries_again(waiting: Veh
     assert waiting.state is VehicleState.FOLLOWING
 
 
-def test_one_that_stands_on_its_route_while_no_way_leads_on_is_stranded(follower: Vehicle) -> None:
-    for at_rest, state in ((False, VehicleState.FOLLOWING), (True, VehicleState.STRANDED)):
-        follower.motion.at_rest = at_rest
-        follower.no_way()
-        assert follower.state is state
-
-
 def test_a_planner_that_has_not_seen_the_target_yet_is_asked_again(waiting: Vehicle) -> None:
     waiting.refuse_route("t0", RouteStatus.NO_TARGET, S)
     assert waiting.state is VehicleState.WAITING
@@ -216,3 +211,62 @@ def test_the_table_of_transitions_has_all_that_vehicles_can_make_and_no_other(mo
         for _ in range(60):
             random_call(vehicle, chance)
     assert made == table()
+
+
+# --- routes on their way to be driven ------------------------------------------------------------------------
+
+
+def following(*cells: int, here: int | None = None) -> Follower:
+    route = Follower()
+    assert route.begin(cells, [cells[0] if here is None else here])
+    return route
+
+
+def test_a_vehicle_that_was_pushed_comes_back_to_its_route_further_on() -> None:
+    route = following(11, 12, 13, 14)
+    route.moved(12)
+    assert route.ahead(2) == [13, 14]
+    route.moved(23)
+    assert route.ahead(2) == [13, 14]
+    assert route.after(23, 2) == []
+    route.moved(14)
+    assert route.ahead() == []
+
+
+def test_what_comes_after_a_cell_of_the_route_is_known_before_the_vehicle_is_there() -> None:
+    route = following(11, 12, 13, 14)
+    assert route.after(12, 1) == [13]
+    assert route.after(14, 3) == []
+    assert route.near(2) == [11, 12]
+
+
+def test_a_route_ends_before_the_first_step_ahead_that_is_closed() -> None:
+    route = following(11, 12, 13, 14, here=12)
+    assert not route.cut(lambda cells: len(cells) - 1)
+    assert route.cut(lambda cells: cells.index(13))
+    assert route.ahead() == [13]
+
+
+@given(st.integers(1, 10), st.integers(0, 99), st.lists(st.integers(0, 8), max_size=12).map(bytes))
+def test_directions_from_the_network_become_cells_and_back_or_nothing(cols: int, start: int, codes: bytes) -> None:
+    grid = GridSpec(10, cols, 10.0)
+    with contextlib.suppress(ValueError):
+        cells = walk(grid, start, codes)
+        assert directions_of(cells, cols) == directions_of(np.array(cells), cols) == codes
+
+
+@given(st.lists(st.lists(st.integers(0, 99), max_size=4), max_size=20))
+def test_bounds_of_a_route_are_those_of_its_cells_whatever_has_changed(routes: list[list[int]]) -> None:
+    route = Follower()
+    for cells in routes:
+        if not cells:
+            route.drop()
+        else:
+            assert route.begin(cells, cells)
+        assert route.left == len(route.ahead())
+        north, west, south, east = route.bounds(GRID.cols)
+        rows, cols = [cell // GRID.cols for cell in cells], [cell % GRID.cols for cell in cells]
+        if cells:
+            assert (north, west, south, east) == (min(rows), min(cols), max(rows), max(cols))
+        else:
+            assert north - 1 > south + 1  # nothing is in it, nor in one that is a cell wider
