@@ -16,12 +16,6 @@ from swarm.wire.messages.traffic import Claim, Table
 from swarm.wire.topics import MARKS, RUN, TABLE
 
 
-def test_a_query_that_no_one_serves_ends_empty(world: World):
-    a = world.bus("a")
-    world.settle()
-    assert asked(world, a, RUN, Nothing()) == [AskEnded("q", RUN, 0, None)]
-
-
 def test_a_query_is_answered_once(world: World):
     a, b = world.bus("a"), world.bus("b")
     b.serve(RUN, answering((run_info(id="b"), {})), role="agent", id="b")
@@ -109,16 +103,6 @@ def test_a_query_that_is_never_ended_times_out_with_what_came(world: World):
     box = asked(world, a, RUN, Nothing(), timeout_s=0.3)
     assert [event.message.id for event in box.of(Replied)] == ["b"]
     assert box[-1] == AskEnded("q", RUN, 1, "timeout")
-
-
-def test_answers_may_come_later_than_the_event(world: World):
-    _, _, question, box = waiting(world)
-    world.settle()
-    assert box == []
-    question.answer(run_info(id="b"))
-    question.end()
-    world.until(lambda: box.of(AskEnded))
-    assert len(box.of(Replied)) == 1
 
 
 def test_who_serves_learns_how_long_the_asker_waits_and_that_it_has_left(world: World):
