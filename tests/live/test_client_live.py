@@ -18,23 +18,17 @@ from itertools import pairwise
 from pathlib import Path
 
 import pytest
-from support.live_swarm import SWARM, LiveSwarm, ask, client
+from support.live_swarm import SWARM, LiveSwarm
 from support.live_swarm import swarm as command
 from support.processes import eventually
 
 from swarm.bus.zenoh_bus import open_bus
 from swarm.client import BusError, ConfigError, Swarm, SwarmError, connect
 from swarm.clock import NS_PER_S
-from swarm.grid import GridSpec, walk
 from swarm.right_of_way.external_session import ExternalSession
 from swarm.right_of_way.generations import GenerationFile
 from swarm.runtime.run_secret import authenticator_of
 from swarm.runtime.tracker_ownership import SAME_NS
-from swarm.wire.messages import Nothing
-from swarm.wire.messages.planning import RouteRequest
-from swarm.wire.messages.processes import RunInfo
-from swarm.wire.route_columns import RouteStatus
-from swarm.wire.topics import ROUTE, RUN
 
 pytestmark = [pytest.mark.network, pytest.mark.slow]
 
@@ -183,20 +177,12 @@ def test_a_vehicle_with_right_of_way_reserves_its_way_and_is_let_in_cell_by_cell
 # --- vehicles that are not in the scenario: a program's own, and those that `swarm order vehicle add` drives ---
 
 
-@pytest.fixture(scope="module")
-def info(live: LiveSwarm) -> RunInfo:
-    with client(live.network) as bus:
-        return next(each for each in ask(bus, RUN, Nothing()) if each.run_id)
-
-
-def route_of(live: LiveSwarm, grid: GridSpec) -> list[int]:
-    """The first cells of a route to a target."""
-    with client(live.network) as bus:
-        for n in range(10, 90, 7):
-            (reply,) = ask(bus, ROUTE, RouteRequest(row=n, col=n, max_cells=12), target="t0")
-            route = reply.routes[0]
-            if route.status is RouteStatus.OK and len(route.directions) >= 12:
-                return walk(grid, route.start, route.directions)
+def route_of(swarm: Swarm) -> list[int]:
+    """The first cells of a route to a target, from somewhere along the diagonal."""
+    for n in range(10, 90, 7):
+        route = swarm.route_soon("t0", *swarm.frame.centre_m(swarm.frame.grid.cell(n, n))).result(20.0)
+        if len(route.cells) > 12:
+            return list(route.cells[:12])
     raise AssertionError("no route of twelve cells from anywhere")
 
 
@@ -219,22 +205,21 @@ with connect(endpoint) as swarm:
 """
 
 
-def session_of(live: LiveSwarm, info: RunInfo, name: str, file: Path) -> ExternalSession:
-    bus = open_bus(live.network, authenticator=authenticator_of(live.network, info.run_id))
-    return ExternalSession(name, GridSpec(info.rows, info.cols, info.resolution_m), bus, GenerationFile(file))
+def session_of(live: LiveSwarm, swarm: Swarm, name: str, folder: Path) -> ExternalSession:
+    bus = open_bus(live.network, authenticator=authenticator_of(live.network, live.run_dir.name))
+    return ExternalSession(name, swarm.frame.grid, bus, GenerationFile(folder / name))
 
 
-def test_ones_own_program_drives_dies_comes_back_and_leaves(live: LiveSwarm, info: RunInfo, tmp_path: Path) -> None:
-    path = route_of(live, GridSpec(info.rows, info.cols, info.resolution_m))
-    words = [sys.executable, "-c", ROVER, live.endpoint, tmp_path / "rover", *path[:6]]
-    program = subprocess.Popen(list(map(str, words)), stdout=subprocess.PIPE, text=True)
+def test_ones_own_program_drives_dies_comes_back_and_leaves(live: LiveSwarm, swarm: Swarm, tmp_path: Path) -> None:
+    path = route_of(swarm)
+    program = Run(ROVER, live.endpoint, live.endpoint, tmp_path / "rover", *path[:6]).process
     assert program.stdout.readline() == "there\n"
     program.kill()
     program.wait(10)
-    with session_of(live, info, "other", tmp_path / "other") as other:
+    with session_of(live, swarm, "other", tmp_path) as other:
         # The rover stands there, though its lease as an obstacle is over.
         assert not other.enter(path[5], timeout_s=4.0)
-        with session_of(live, info, "rover", tmp_path / "rover") as rover:
+        with session_of(live, swarm, "rover", tmp_path) as rover:
             assert rover.enter(path[5], timeout_s=10.0)
             rover.want(path[5:])
             for here, there in pairwise(path[5:]):
@@ -243,13 +228,13 @@ def test_ones_own_program_drives_dies_comes_back_and_leaves(live: LiveSwarm, inf
             assert other.may_enter(path[5], timeout_s=10.0)  # what it has asked for all the time
         assert other.leave(timeout_s=10.0)
         assert other.enter(path[-1], timeout_s=10.0)  # the rover has left
-    with session_of(live, info, "third", tmp_path / "third") as third:
+    with session_of(live, swarm, "third", tmp_path) as third:
         assert third.enter(path[-1], timeout_s=10.0)
 
 
-def vehicles_of(live: LiveSwarm, agent: str, count: int) -> set[str]:
+def vehicles_of(swarm: Swarm, agent: str, count: int) -> set[str]:
     """The vehicles that an agent reports, once the number is reached."""
-    with connect(live.endpoint) as joined, joined.observer() as seen:
+    with swarm.observer() as seen:
 
         def reported() -> set[str]:
             return {id for id in list(seen.vehicles) if id.startswith(agent)}
@@ -264,11 +249,11 @@ def add(live: LiveSwarm, *options: object) -> subprocess.Popen[str]:
     return subprocess.Popen(list(map(str, words)), stderr=subprocess.PIPE, text=True)
 
 
-def test_vehicles_are_added_and_removed_while_the_swarm_runs(live: LiveSwarm, info: RunInfo) -> None:
-    where = ("--connect", live.endpoint, "--namespace", live.network.namespace)
+def test_vehicles_are_added_and_removed_while_the_swarm_runs(live: LiveSwarm, swarm: Swarm) -> None:
+    where = ("--connect", live.endpoint)
     added = add(live, "--count", 3, "--id", "extra")
     try:
-        assert vehicles_of(live, "extra", count=3) == {"extra-00", "extra-01", "extra-02"}
+        assert vehicles_of(swarm, "extra", count=3) == {"extra-00", "extra-01", "extra-02"}
         done = command("order", "vehicle", "remove", "extra-01", "a0-02", *where)
         assert (done.returncode, done.stderr) == (0, "")
         assert "extra-01: left" in done.stdout
@@ -283,13 +268,13 @@ def test_vehicles_are_added_and_removed_while_the_swarm_runs(live: LiveSwarm, in
 
 
 def test_vehicles_of_a_killed_process_stay_until_it_is_back_or_a_person_says_that_they_are_gone(
-    live: LiveSwarm, info: RunInfo
+    live: LiveSwarm, swarm: Swarm
 ) -> None:
-    where = ("--connect", live.endpoint, "--namespace", live.network.namespace)
+    where = ("--connect", live.endpoint)
     for again in range(2):
         added = add(live, "--count", 2, "--id", "more", "--at", "40,60")
         try:
-            assert len(vehicles_of(live, "more", count=2)) == 2, again
+            assert len(vehicles_of(swarm, "more", count=2)) == 2, again
         finally:
             added.send_signal(signal.SIGKILL)
             added.wait(10)

@@ -87,6 +87,9 @@ def test_a_person_asks_for_a_route_and_for_the_status(live: LiveSwarm, bus: Zeno
     told = swarm("route", "--target", "t7", "--from", f"cell:{row},{col}", "--connect", live.endpoint)
     assert (told.returncode, told.stdout) == (4, "")
     assert told.stderr.endswith("there are: 't0', 't1'\n")
+    told = swarm("order", "vehicle", "send", "a0-01", "cell:5,5", "--connect", live.endpoint)
+    assert (told.returncode, told.stderr.count("\n")) == (2, 1)
+    assert "needs planner.places = true" in told.stderr
     status = json.loads(swarm("status", "--connect", live.endpoint, "--json").stdout)
     assert len(status["processes"]) == 8
     assert [planner["target"] for planner in status["planners"]] == ["t0", "t1"]

@@ -10,24 +10,18 @@ from pathlib import Path
 
 import msgspec
 import pytest
-from support.bus_world import decoded
-from support.client_rig import keeper_info
 from support.live_swarm import Hands, swarm
-from support.makers import route_reply
 from support.processes import eventually
 
 from launch_scripts.commands.shared_options import Tls
 from launch_scripts.launcher.run_options import as_process
 from launch_scripts.ports import free_ports
-from swarm.bus.bus import Asked, Event, Heard
+from swarm.bus.bus import Event, Heard
 from swarm.bus.zenoh_bus import ZenohBus, open_bus
-from swarm.client import BusError, connect
+from swarm.client import Swarm, connect
 from swarm.config.scenario_files import load_scenario
-from swarm.grid import GridSpec
-from swarm.wire.messages import WIRE_VERSION
 from swarm.wire.messages.processes import Stats
-from swarm.wire.route_columns import Route, RouteBatch, RouteStatus
-from swarm.wire.topics import MARKS, OBSTACLE, ROUTE, RUN, STATS
+from swarm.wire.topics import STATS
 
 pytestmark = [pytest.mark.network, pytest.mark.slow]
 
@@ -54,6 +48,7 @@ def issue(hands: Hands, *arguments: str) -> Path:
 def test_launchers_on_two_machines_make_one_run_each_with_certificates_of_its_own_processes(
     hands: Hands,
 ) -> None:
+    hands.path.write_text(hands.path.read_text().replace("[network]", '[network]\nadmit = ["rover.all.r1"]'))
     certs = issue(hands)
     car = hands.folder / "car"
     car.mkdir()
@@ -78,9 +73,21 @@ def test_launchers_on_two_machines_make_one_run_each_with_certificates_of_its_ow
         return sum(planner["routes_served"] for planner in status.get("planners", ()))
 
     eventually(lambda: routed() >= 12, 90, "routes for all vehicles")
+
+    def joined(name: str) -> Swarm:
+        files = [str(certs / file) for file in ("ca.pem", f"{name}.pem", f"{name}.key")]
+        return connect(endpoint, ca=files[0], certificate=files[1], key=files[2])
+
+    operator = next(certs.glob("operator.*.pem")).stem
+    with joined(operator) as watcher, watcher.observer() as seen, joined("rover.all.r1") as program:
+        for id in ("r2", "r1"):
+            program.vehicle(id).at(*program.frame.centre_m(program.frame.grid.cell(40, 60)))
+        eventually(lambda: "r1" in seen.vehicles, 10, "the vehicle of its own name")
+        assert "r2" not in seen.vehicles
     for process in (part, base):
         process.send_signal(signal.SIGINT)
-        assert process.wait(30) == 0, hands.logs()
+        eventually(lambda process=process: process.poll() is not None, 30, "its end")  # type: ignore[misc]
+        assert process.returncode == 0, hands.logs()
     reports = list(hands.folder.glob("*/small-*/report.json"))
     assert [path.parent.parent.name for path in reports] == ["runs"]
     assert json.loads(reports[0].read_text())["routes_served"] >= 12
@@ -136,48 +143,3 @@ def test_a_name_that_is_revoked_is_denied_while_the_router_runs_and_its_successo
             assert says(successor, "a1")
             assert not says(stolen, "a1")
     assert "line 1: 'no name' is no name in a certificate" in hands.logs()
-
-
-def test_a_rover_with_a_certificate_reports_marks_and_asks_under_its_own_name_only(hands: Hands) -> None:
-    hands.path.write_text(hands.path.read_text().replace("[network]", '[network]\nadmit = ["rover.all.r1"]'))
-    certs = issue(hands)
-    endpoint = f"tls/localhost:{free_ports(1)[0]}"
-    hands.start("role", "router", str(hands.path), "--listen", endpoint, *tls(certs))
-    eventually(lambda: swarm("status", "--connect", endpoint, *tls(certs)).returncode == 0, 30, "the router")
-    run = msgspec.structs.replace(
-        keeper_info(GridSpec(96, 128, 30.0)), now_ns=time.time_ns(), wire_version=WIRE_VERSION
-    )
-    heard: list[str] = []
-
-    def tell(event: Event) -> None:
-        if isinstance(event, Heard):
-            heard.append("/".join((event.topic.name, event.fields.get("id") or event.fields["author"])))
-
-    def answer(event: Event) -> None:
-        assert isinstance(event, Asked)
-        route = Route(status=RouteStatus.OK, start=0, directions=b"\2", cost_s=3.0, lower_bound_s=3.0)
-        reply = route_reply(RouteBatch.of([route]), GridSpec(96, 128, 30.0), target_cell=1)
-        event.answer(run if event.topic is RUN else reply)
-        event.end()
-
-    with (
-        opened(hands, "keeper", "0", certs, endpoint) as keeper,
-        opened(hands, "planner", "t0", certs, endpoint) as planner,
-        opened(hands, "agent", "a0", certs, endpoint) as agent,
-    ):
-        keeper.serve(RUN, decoded(answer), role="keeper", id="0")
-        keeper.subscribe(MARKS, tell)
-        planner.serve(ROUTE, decoded(answer), target="t0")
-        agent.subscribe(OBSTACLE, tell)
-        files = [str(certs / name) for name in ("ca.pem", "rover.all.r1.pem", "rover.all.r1.key")]
-        with connect(endpoint, ca=files[0], certificate=files[1], key=files[2]) as program:
-            other, rover = program.vehicle("r2"), program.vehicle("r1")
-            for vehicle in (other, rover):
-                vehicle.at(15.0, -15.0)
-                vehicle.mark([5], lethal=True)
-            assert rover.route("t0").cost_s == 3.0
-            marks = f"marks/all.r1.{rover.incarnation:x}"
-            eventually(lambda: {"body/r1", marks} <= set(heard), 5, "what is its own")
-            with pytest.raises(BusError, match="no route to 't1'"):
-                rover.route("t1", timeout_s=0.5)
-        assert set(heard) == {"body/r1", marks}, "and nothing of r2"

@@ -30,7 +30,7 @@ from support.zenoh_router import Router
 from docs.generate.wire_page import JSON_PATH as WIRE_PAGE
 from docs.generate.wire_page import example, key_fields, put_from_outside
 from launch_scripts.ports import free_ports
-from swarm.bus.bus import Appeared, Asked, AskEnded, Disappeared, Heard, LinkChanged, Replied, meant_for
+from swarm.bus.bus import Appeared, Asked, AskEnded, Disappeared, Heard, Replied, meant_for
 from swarm.bus.zenoh_bus import ZenohAnswerer, ZenohBus, open_bus
 from swarm.clock import MonotonicClock
 from swarm.config.scenario import NetworkConfig
@@ -162,47 +162,48 @@ def test_the_least_json_of_the_reference_is_heard_on_each_key_where_programs_out
     assert b.counts["payloads_dropped"] == 0
 
 
-def serve_cost(bus: ZenohBus) -> list[CostRequest]:
-    """Serves the cost of t0. Returns the requests, as they come."""
-    requests: list[CostRequest] = []
-    reply = cost_reply([2.5, float("inf")])
+class Served:
+    """The cost of t0, which a planner serves.
 
-    def post(event: Asked) -> None:
-        requests.append(event.request)
-        event.answer(reply)
+    requests  as they come
+    stranger  a session that asks
+    """
+
+    def __init__(self, world: ZenohWorld) -> None:
+        self.requests: list[CostRequest] = []
+        self.planner = world.bus("planner")
+        self.planner.serve(NAMELESS_COST, decoded(self._answer), target="t0")
+        self.stranger = world.bus("stranger").session
+        world.settle()
+
+    def _answer(self, event: Asked) -> None:
+        self.requests.append(event.request)
+        event.answer(cost_reply([2.5, float("inf")]))
         event.end()
 
-    bus.serve(NAMELESS_COST, decoded(post), target="t0")
-    return requests
+
+@pytest.fixture
+def cost(world: ZenohWorld) -> Served:
+    return Served(world)
 
 
-def test_any_zenoh_session_gets_a_readable_answer(world):
-    requests = serve_cost(world.bus("planner"))
-    stranger = world.bus("stranger").session
-    world.settle()
-    replies = list(stranger.get("swarm/target/*/cost?row=4;col=5;format=json;key=target/*/cost", timeout=2.0))
+def test_any_zenoh_session_gets_a_readable_answer(cost: Served):
+    replies = list(cost.stranger.get("swarm/target/*/cost?row=4;col=5;format=json;key=target/*/cost", timeout=2.0))
     assert [str(reply.ok.key_expr) for reply in replies] == ["swarm/target/t0/cost"]
     assert json.loads(replies[0].ok.payload.to_bytes())["cost_to_go_s"] == [2.5, None]
     assert replies[0].ok.encoding == zenoh.Encoding.APPLICATION_JSON
-    assert requests == [CostRequest(row=4, col=5)]
+    assert cost.requests == [CostRequest(row=4, col=5)]
 
 
-def test_a_query_for_everything_is_answered_and_harms_no_one(world):
+def test_a_query_for_everything_is_answered_and_harms_no_one(cost: Served):
     """`**` fits no template: the thread that serves must survive it."""
-    requests = serve_cost(world.bus("planner"))
-    stranger = world.bus("stranger").session
-    world.settle()
     for expression in ("**", "swarm/**", "swarm/target/**/cost", "swarm/target/t0/cost"):
-        replies = list(stranger.get(expression, timeout=2.0))
+        replies = list(cost.stranger.get(expression, timeout=2.0))
         assert [str(reply.ok.key_expr) for reply in replies] == ["swarm/target/t0/cost"], expression
-    assert len(requests) == 4
+    assert len(cost.requests) == 4
 
 
-def test_a_bad_request_is_refused_in_words_and_counted(world):
-    planner = world.bus("planner")
-    requests = serve_cost(planner)
-    stranger = world.bus("stranger").session
-    world.settle()
+def test_a_bad_request_is_refused_in_words_and_counted(cost: Served):
     for selector, payload, complaint in (
         ("swarm/target/t0/cost?rwo=4", None, b"unknown parameter 'rwo'"),
         ("swarm/target/t0/cost?row=4", None, b"both row and col"),
@@ -212,22 +213,19 @@ def test_a_bad_request_is_refused_in_words_and_counted(world):
         ("swarm/target/t0/cost", encode(CostRequest(row=4, col=5)), b"no key, expected 'target/t0/cost'"),
         ("swarm/target/t0/cost", meant_for("target/t0/cost", encode(Nothing())), b"schema"),
     ):
-        (reply,) = stranger.get(selector, payload=payload, timeout=2.0)
+        (reply,) = cost.stranger.get(selector, payload=payload, timeout=2.0)
         assert complaint in reply.err.payload.to_bytes()
-    assert requests == []
-    assert (planner.counts["payloads_dropped"], planner.counts["payloads_misrouted"]) == (5, 2)
+    assert cost.requests == []
+    assert (cost.planner.counts["payloads_dropped"], cost.planner.counts["payloads_misrouted"]) == (5, 2)
 
 
-def test_what_a_refused_question_said_is_freed_without_a_collection_of_garbage(world, caplog):
+def test_what_a_refused_question_said_is_freed_without_a_collection_of_garbage(world, cost: Served, caplog):
     caplog.set_level(logging.ERROR)  # a record that is kept has the error
-    planner, stranger = world.bus("planner"), world.bus("stranger").session
-    serve_cost(planner)
-    world.settle()
     gc.collect()
     gc.disable()
     try:
         for parameters, payload in (("", b"garbage"), ("?timeout_s=never", None), (f"?a={'x' * 300_000}", None)):
-            replies = list(stranger.get(f"swarm/target/t0/cost{parameters}", payload=payload, timeout=3.0))
+            replies = list(cost.stranger.get(f"swarm/target/t0/cost{parameters}", payload=payload, timeout=3.0))
             assert [reply.ok for reply in replies] == [None]
         world.until(lambda: not [each for each in gc.get_objects() if isinstance(each, ZenohAnswerer)])
     finally:
@@ -294,24 +292,6 @@ def test_garbage_is_logged_once_per_topic_whatever_its_keys(world, caplog):
     told = [record.getMessage() for record in caplog.records if "dropped" in record.getMessage()]
     assert len(told) == 1
     assert told[0].startswith("dropped a payload on swarm/target/t0/pose")
-
-
-def test_a_router_killed_and_started_again_is_found_by_everybody(world):
-    a, b = world.bus("a"), world.bus("b")
-    links, heard = Box(), Box()
-    b.serve(RUN, answering((run_info(id="b"), {})), role="agent", id="b")
-    a.watch_links(links)
-    a.subscribe(POSE, heard)
-    world.settle()
-    for times in (1, 2):
-        world.router.kill()
-        world.until(lambda: links[-1:] == [LinkChanged(False)])
-        world.router.start()
-        world.until(lambda: links[-1:] == [LinkChanged(True)], within_s=10)
-        world.until(lambda: asked(world, a, RUN, Nothing()).of(Replied), within_s=10)
-        b.publish(POSE, pose(seq=times), target="t0")
-        world.until(lambda times=times: len(heard) == times)
-        assert heard[-1] == Heard(POSE, {"target": "t0"}, pose(seq=times))
 
 
 ENDS_WITHOUT_CLOSING = """
@@ -583,22 +563,18 @@ def test_what_is_said_again_under_another_key_or_to_another_question_does_not_co
     spy.undeclare()
 
 
-def test_a_person_asks_in_json_and_is_answered_in_json_or_told_what_is_wrong(world: ZenohWorld):
-    a, b = world.bus("a"), world.bus("b")
-    requests = serve_cost(a)
-    world.settle()
-
+def test_a_person_asks_in_json_and_is_answered_in_json_or_told_what_is_wrong(cost: Served):
     def get(text: str):
         encoding = zenoh.Encoding.APPLICATION_JSON
-        (reply,) = b.session.get("swarm/target/t0/cost", payload=text, encoding=encoding, timeout=3.0)
+        (reply,) = cost.stranger.get("swarm/target/t0/cost", payload=text, encoding=encoding, timeout=3.0)
         return reply
 
     reply = get('{"key": "target/t0/cost", "row": 4, "col": 2}')
     assert json.loads(reply.ok.payload.to_bytes())["cost_to_go_s"] == [2.5, None]
-    assert requests == [CostRequest(row=4, col=2)]
+    assert cost.requests == [CostRequest(row=4, col=2)]
     wrong = get('{"rwo": 4}').err.payload.to_string()
     assert wrong == "nameless-cost: unknown field 'rwo'; CostRequest has cells, row, col, vehicle_class"
-    assert a.counts["payloads_dropped"] == 1
+    assert cost.planner.counts["payloads_dropped"] == 1
 
 
 def test_who_waits_for_a_router_waits_behind_a_proxy_that_has_none_yet(caplog: pytest.LogCaptureFixture) -> None:

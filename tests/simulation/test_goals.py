@@ -69,19 +69,3 @@ def test_every_vehicle_gets_to_its_place_despite_any_crash(seed: int, terrain: T
     assert all(reason.startswith(lethal) if state == "blocked" else not reason for state, reason in found.values())
     assert len(open_now) > len(ids) // 2
     assert laws.collisions == laws.lethal == []
-
-
-def test_vehicles_chase_again_once_they_have_been_where_they_were_sent(terrain: Terrain) -> None:
-    simulation = OrderedSimulation(scenario(1), terrain=terrain)
-    simulation.run_until(4.0)
-    here, grid = vehicles(simulation)["a0-00"].cell, terrain.grid
-    first, second, *_ = sorted(open_cells(terrain, 1, 40), key=lambda cell: grid.distance_cells(here, cell))
-    simulation.give(sent(terrain, "a0-00", first, second, then="chase"))
-    simulation.run_until(5.0)
-    assert vehicles(simulation)["a0-00"].target not in ("t0", "t1")
-    while vehicles(simulation)["a0-00"].target not in ("t0", "t1"):
-        assert simulation.now_s < 120.0
-        simulation.run_until(simulation.now_s + 1.0)
-    simulation.run_until(simulation.now_s + 2.0)
-    (state,) = simulation.recorder.observed.goals()
-    assert (state.done, state.state, state.cell) == (2, "completed", None)

@@ -160,21 +160,6 @@ def test_an_output_that_was_another_is_found_at_its_event(run: Path, data: st.Da
     assert outcome.events == max(event - 1, 0)
 
 
-def test_a_recording_that_ends_anywhere_is_replayed_up_to_there(run: Path, tmp_path: Path) -> None:
-    source = next(each.path for each in recordings_of(run, "planner-t0")[0] if each.generation == 2)
-    content = source.read_bytes()
-    (tmp_path / "inputs").mkdir()
-    path = tmp_path / "inputs" / source.name
-    events = []
-    for length in (len(content), len(content) * 2 // 3, len(content) // 2 + 1, len(content) // 2):
-        path.write_bytes(content[:length])
-        (found,) = replay_run(tmp_path)
-        assert found.same, found
-        events.append(found.outcome.events)
-    assert events == sorted(events, reverse=True)
-    assert events[0] > events[-1] > 0
-
-
 @settings(deadline=None)
 @given(st.data())
 def test_a_damaged_recording_is_said_in_a_sentence(run: Path, data: st.DataObject) -> None:

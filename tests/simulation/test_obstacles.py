@@ -7,7 +7,7 @@ import pytest
 
 from launch_scripts.simulation.faults import random_plan
 from launch_scripts.simulation.laws import LawBook
-from launch_scripts.simulation.sample_worlds import CROWDS, SMALL, crowd, seeded
+from launch_scripts.simulation.sample_worlds import CROWDS, crowd
 from launch_scripts.simulation.simulate import Simulation
 from launch_scripts.simulation.world.service import TargetsService
 from swarm.config.scenario import RoverConfig
@@ -46,14 +46,3 @@ def test_vehicles_that_do_not_look_at_obstacles_drive_into_them_and_the_referee_
     law, counts = driven("open", 1, 5.0, faults=False)
     assert law.driven_into
     assert counts["driven_into"] > 0
-
-
-def test_targets_that_are_obstacles_are_captured_and_not_driven_into() -> None:
-    target = msgspec.structs.replace(SMALL.targets[0], obstacle_radius_m=1.0)
-    vehicles = msgspec.structs.replace(SMALL.vehicles, capture_range_m=65.0)
-    simulation = Simulation(msgspec.structs.replace(seeded(1), targets=(target,), vehicles=vehicles))
-    simulation.run_until(15.0)
-    service = simulation.nodes["targets-0"].service
-    assert isinstance(service, TargetsService)
-    assert service.counters.counts["captures"] > 0
-    assert service.counters.counts["driven_into"] == 0

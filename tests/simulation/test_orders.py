@@ -77,16 +77,6 @@ def test_a_stopped_vehicle_stands_and_the_others_drive_on(terrain: Terrain) -> N
     assert laws.collisions == []
 
 
-def test_a_group_chases_what_it_is_told_and_then_again_all(terrain: Terrain) -> None:
-    simulation = simulated(terrain)
-    simulation.order(4.0, GiveOrder(subject="group", name="all", targets=["t1"]))
-    simulation.run_until(8.0)
-    assert {vehicle.target for vehicle in vehicles(simulation).values()} == {"t1"}
-    simulation.order(8.0, GiveOrder(subject="group", name="all", off=True))
-    simulation.run_until(16.0)
-    assert {vehicle.target for vehicle in vehicles(simulation).values()} == {"t0", "t1"}
-
-
 def test_an_added_target_is_chased_and_a_removed_one_leaves_no_one_lost(terrain: Terrain) -> None:
     simulation = simulated(terrain)
     laws = LawBook(simulation)

@@ -13,6 +13,7 @@ from support.simulated import simulate
 from launch_scripts.simulation.simulate import Simulation
 from launch_scripts.simulation.trials import Trial, run_trial
 from swarm.config.plugin_names import PLUGIN_KINDS
+from swarm.config.scenario import Scenario
 from swarm.config.scenario_files import load_scenario
 from swarm.wire.messages.processes import Note
 
@@ -62,23 +63,6 @@ def write_example(kind: str, folder: Path, more: str = "") -> Path:
     for _, name, text in _BLOCK.findall(page.read_text(encoding="utf-8")):
         (folder / name).write_text(more + text if name == "scenario.toml" else text, encoding="utf-8")
     return folder / "scenario.toml"
-
-
-def write_all_examples(folder: Path, more: str) -> Path:
-    """Like `write_example` for all pages together: one scenario with a plug-in of every kind, after `more`."""
-    arrays: list[str] = []
-    tables: dict[str, list[str]] = {}
-    for kind in PLUGIN_KINDS:
-        text = write_example(kind, folder).read_text(encoding="utf-8")
-        for header, body in re.findall(r"^(\[.+\])\n((?:[^\[\n].*\n)+)", text, re.MULTILINE):
-            if header.startswith("[["):
-                arrays.append(f"{header}\n{body}")
-            else:
-                tables.setdefault(header, []).append(body)
-    merged = [f"{header}\n{''.join(bodies)}" for header, bodies in tables.items()]
-    path = folder / "scenario.toml"
-    path.write_text("\n".join([more, *merged, *arrays]), encoding="utf-8")
-    return path
 
 
 @pytest.mark.parametrize("page", PLUGIN_KINDS)
@@ -191,21 +175,26 @@ planner = { strategy = "wild:Wild" }
 """
 
 
-@pytest.mark.seeds(3)
-def test_whatever_plugins_say_under_all_faults_no_law_of_safety_breaks(seed: int, tmp_path: Path) -> None:
-    """Sensors that lie put walls around vehicles, and dynamics let them stand: they may wait, and nothing else."""
+@pytest.fixture
+def wild(tmp_path: Path) -> Scenario:
+    """Plug-ins that answer at random."""
     (tmp_path / "wild.py").write_text(WILD)
     (tmp_path / "scenario.toml").write_text(WILD_SCENARIO)
-    result = run_trial(Trial("", "wild", load_scenario(tmp_path / "scenario.toml"), seed, 12.0, True))
+    return load_scenario(tmp_path / "scenario.toml")
+
+
+@pytest.mark.seeds(3)
+def test_whatever_plugins_say_under_all_faults_no_law_of_safety_breaks(seed: int, wild: Scenario) -> None:
+    """Sensors that lie put walls around vehicles, and dynamics let them stand: they may wait, and nothing else."""
+    result = run_trial(Trial("", "wild", wild, seed, 12.0, True))
     assert [law for law in result.broken if " waits " not in law.sentence] == []
 
 
-def test_a_seed_replays_a_run_with_plugins(tmp_path: Path) -> None:
+def test_a_seed_replays_a_run_with_plugins(wild: Scenario) -> None:
     traces = []
     for _ in range(2):
-        scenario = load_scenario(write_all_examples(tmp_path, SMALL))
         log = io.StringIO()
-        simulate(scenario, seconds=8.0, trace=log)
+        simulate(wild, seconds=8.0, trace=log)
         traces.append(log.getvalue())
     assert len(traces[0]) > 10_000
     assert traces[0] == traces[1]

@@ -8,7 +8,6 @@ import re
 import subprocess
 import sys
 
-import msgspec
 import numpy as np
 import pytest
 from support.simulated import simulate
@@ -18,8 +17,7 @@ from launch_scripts.simulation.faults import FaultPlan, random_plan
 from launch_scripts.simulation.laws import LONGEST_WAIT_S, BrokenLaw, LawBook
 from launch_scripts.simulation.sample_worlds import MIXED, SMALL, seeded
 from launch_scripts.simulation.simulate import Simulation
-from launch_scripts.simulation.trials import MIX, SECONDS, Result, Trial, replay_of, run_trial, world_of
-from swarm.config.scenario import Scenario
+from launch_scripts.simulation.trials import MIX, SECONDS, Result, replay_of, world_of
 from vehicle_agent.traffic.next_cells import Steering
 
 RUN = """
@@ -66,25 +64,10 @@ def test_neither_watching_nor_recording_a_run_changes_it(tmp_path):
     assert one["deliveries"] == sum(" > " in line for line in lines)
 
 
-def result_of(seed: int, name: str = "small", given: Scenario | None = None) -> Result:
-    """The result of four simulated seconds of a seed, without the time that they take."""
-    result = run_trial(Trial("", name, given, seed, 4.0, True))
-    return msgspec.structs.replace(result, wall_s=0.0, cpu_s=0.0)
-
-
-def test_a_seed_does_the_same_again_and_another_does_not():
-    assert result_of(0) == result_of(0) != result_of(1)
-
-
 def test_the_mix_takes_every_world_in_turn_and_a_replay_names_it():
     assert [world_of(MIX, seed) for seed in range(6)] == list(MIXED)
     assert replay_of("doors", 9, 30.0, SECONDS) == "swarm simulate doors --seeds 9:10"
     assert replay_of("doors", 9, 5.0, SECONDS).endswith("--seconds 5")
-
-
-def test_a_scenario_of_ones_own_is_tried_too():
-    mine = result_of(3, "mine", msgspec.structs.replace(SMALL, name="mine"))
-    assert mine.figures["deliveries"] == result_of(3).figures["deliveries"]
 
 
 def test_a_process_that_never_comes_back_breaks_a_law():

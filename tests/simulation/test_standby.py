@@ -6,13 +6,13 @@ from typing import Any
 import msgspec
 import pytest
 
-from launch_scripts.simulation.faults import Crash, FaultPlan, Partition
+from launch_scripts.simulation.faults import Crash, FaultPlan
 from launch_scripts.simulation.laws import LawBook
 from launch_scripts.simulation.sample_worlds import SMALL, seeded
 from launch_scripts.simulation.simulate import Node, Simulation
 from planner_service.service import PlannerService
 from swarm.bus.bus import Event, Heard, Replied
-from swarm.config.scenario import Scenario, StandbyConfig
+from swarm.config.scenario import StandbyConfig
 from swarm.wire.messages.planning import RouteReply, RouteRequest, TargetPose
 from swarm.wire.route_columns import RouteStatus
 from swarm.wire.topics import POSE, ROUTE
@@ -96,18 +96,6 @@ def test_vehicles_are_pushed_routes_by_a_standby_as_soon_as_it_leads() -> None:
     assert all(each.route is not None for _, each in known if not each.stale)
 
 
-def test_both_sides_of_a_cut_are_planned_for_and_one_planner_leads_when_it_heals() -> None:
-    plan = FaultPlan(partitions=(Partition(8, 14, ("planner-t0.r1", "agent-a0")),))
-    simulation = Simulation(seeded(2, STANDING_BY), faults=plan)
-    asker = Asker(simulation, 20)
-    simulation.run_until(12)
-    assert leaders(simulation, "t0") == ["planner-t0", "planner-t0.r1"]
-    simulation.run_until(15.5)
-    assert leaders(simulation, "t0") == ["planner-t0"]
-    simulation.run_until(20)
-    assert asker.longest_gap_s("t0", 5, 20) <= 2 * ASK_S
-
-
 class Poses:
     """The poses of targets as an observer hears them, in order, and the true places."""
 
@@ -153,19 +141,3 @@ def test_the_targets_go_on_from_where_they_are_and_captures_count_on(seed: int) 
     assert told > 0
     # The report lacks the counts since the last publication of the dead process, a second before at most.
     assert told - 1 <= simulation.report(24)["captures"] <= told
-
-
-def test_a_target_that_no_one_tracks_goes_on_too() -> None:
-    [target] = SMALL.targets
-    unseen = msgspec.structs.replace(target, count=1, tracker="sighted")
-    scenario: Scenario = msgspec.structs.replace(STANDING_BY, targets=(unseen,))
-    plan = FaultPlan(crashes=(Crash(6, "targets-0", for_good=True),))
-    simulation = Simulation(seeded(1, scenario), faults=plan)
-    simulation.run_until(5.95)
-    first: Any = simulation.nodes["targets-0"].service
-    was = first._world._targets["t"].walker.cell
-    simulation.run_until(6.8)
-    second: Any = simulation.nodes["targets-0.r1"].service
-    assert second._world.leads
-    now = second._world._targets["t"].walker.cell
-    assert simulation.terrain.grid.distance_cells(was, now) <= 3

@@ -1,10 +1,8 @@
 """The laws hold in the whole swarm, whatever the network and the processes do: a failing seed replays exactly."""
 
-import msgspec
 import numpy as np
 import pytest
-from support.simulated import agents, cells, simulate
-from support.vehicle_states import record, table
+from support.simulated import agents, cells
 
 from launch_scripts.check.scenario_check import one_way_ground
 from launch_scripts.simulation.faults import Crash, FaultPlan, Partition, random_plan
@@ -61,31 +59,6 @@ def test_vehicles_among_one_way_slopes_have_a_route_or_say_that_they_are_strande
     assert LawBook(simulation).run(SECONDS) == []
 
 
-def test_nothing_acknowledged_is_lost_and_no_one_collides_though_keeper_and_agents_die_again_and_again():
-    keepers = [Crash(2 + 1.3 * n, "keeper-0") for n in range(8)]
-    crashes = (*keepers, *(Crash(3 + 0.9 * n, f"agent-a{n % 3}") for n in range(12)))
-    plan = FaultPlan(drop=0.05, duplicate=0.05, jitter_ms=20, reorder=0.05, quiet_s=16, crashes=crashes)
-    simulation = Simulation(seeded(5), faults=plan)
-    laws = check_all(simulation)
-    assert sum(seq for _, seq in laws.acknowledged.values()) > 10
-    assert simulation.nodes["keeper-0"].crashes >= 4
-
-
-def test_an_agent_cut_off_enters_nothing_new_and_goes_on_when_it_is_back():
-    plan = FaultPlan(partitions=(Partition(4, 12, ("agent-a1",)),), quiet_s=16)
-    simulation = Simulation(seeded(2), faults=plan)
-    laws = LawBook(simulation)
-    simulation.run_until(4)
-    agent = agents(simulation)["agent-a1"].agent
-    simulation.run_until(4.2)  # a message in transit before the cut may still be granted
-    held = {id: list(agent.holdings.path(id)) for id in agent.vehicles}
-    simulation.run_until(12)
-    assert all(vehicle.cell in held[id] for id, vehicle in agent.vehicles.items())
-    simulation.run_until(20)
-    assert not all(vehicle.cell in held[id] for id, vehicle in agent.vehicles.items())
-    assert laws.collisions == []
-
-
 def test_an_agent_restarted_while_cut_off_waits_until_someone_tells_where_its_vehicles_stood():
     plan = FaultPlan(partitions=(Partition(4, 12, ("agent-a1",)),), crashes=(Crash(9, "agent-a1"),), quiet_s=16)
     simulation = Simulation(seeded(1), faults=plan)
@@ -101,20 +74,6 @@ def test_an_agent_restarted_while_cut_off_waits_until_someone_tells_where_its_ve
     assert max(simulation.terrain.grid.distance_cells(cell, stood[id]) for id, cell in back.items()) <= 16
     simulation.run_until(20)
     assert laws.collisions == []
-
-
-def test_targets_that_evade_jump_or_stand_still_are_caught():
-    """Every walk at once, in one small world."""
-    walks = ("still", "random", "waypoints", "evade")
-    target = SMALL.targets[0]
-    targets = tuple(
-        msgspec.structs.replace(target, name=walk, count=1, walk=walk, caught=caught)
-        for walk, caught in zip(walks, ("jump", "stay", "jump", "stay"), strict=True)
-    )
-    result = simulate(msgspec.structs.replace(SMALL, targets=targets), seed=4, seconds=15)
-    assert result["captures"] > 0
-    assert result["collisions"] == result["lethal_entries"] == 0
-    assert result["targets"] == 4
 
 
 WITHIN_S = 1.3
@@ -142,16 +101,3 @@ def test_every_vehicle_has_a_route_soon_after_the_last_process_has_started_whate
     assert len(agents) >= 3
     assert routed_s.keys() == set(agents)
     assert max(routed_s.values()) - max(begun_s) < WITHIN_S
-
-
-@pytest.mark.parametrize(
-    ("name", "seed"), [("small", 1), ("small", 4), pytest.param("rovers", 1, marks=pytest.mark.thorough)]
-)
-def test_simulated_vehicles_make_no_transition_but_those_of_the_table(
-    name: str, seed: int, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    made = record(monkeypatch)
-    scenario, terrain = world(name, seed)
-    Simulation(scenario, faults=random_plan(scenario, seed, 8.0), terrain=terrain).run_until(8.0)
-    assert made - table() == set()
-    assert {event for _, event, _ in made} >= {"assign", "give_route"}

@@ -8,7 +8,7 @@ import pytest
 from support.makers import target_pose
 from support.simulated import vehicles
 
-from launch_scripts.simulation.faults import Crash, FaultPlan
+from launch_scripts.simulation.faults import FaultPlan
 from launch_scripts.simulation.laws import LawBook
 from launch_scripts.simulation.sample_worlds import SMALL, seeded
 from launch_scripts.simulation.simulate import EPOCH_NS, Simulation
@@ -235,22 +235,3 @@ def test_a_second_tracker_is_refused_by_everybody_until_the_first_is_dead(seed: 
     assert {"tracker-changed", "tracker-lost"} & set(kinds(simulation))
     report = simulation.report(19)["tracking"]
     assert report["poses_refused"] > 30
-
-
-def test_a_receiver_that_starts_while_two_trackers_tell_follows_the_same_as_all_others() -> None:
-    crashes = tuple(Crash(8 + n, node) for n, node in enumerate(("planner-x", "agent-a0", "targets-0")))
-    simulation = Simulation(seeded(4, EXTERNAL), faults=FaultPlan(drop=0.1, jitter_ms=30, crashes=crashes))
-    OutsideTracker(simulation, "m", 20, 3, 20)
-    OutsideTracker(simulation, "a", 30, 5, 20)
-    simulation.run_until(14)
-    assert owners(simulation) == {"m"}
-
-
-def test_the_poses_of_simulated_targets_age_the_same_way_when_their_process_is_killed() -> None:
-    simulation = Simulation(seeded(1), faults=FaultPlan(crashes=(Crash(10, "targets-0", for_good=True),)))
-    simulation.run_until(15)
-    summary = simulation.recorder.summary(simulation.now_ns)
-    assert [line.lost for line in summary.targets] == [True, True]
-    assert summary.states["outdated"] == 10
-    simulation.finish()
-    assert simulation.report(15)["tracking"]["lost_at_end"] == ["t0", "t1"]

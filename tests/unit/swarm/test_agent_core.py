@@ -3,7 +3,7 @@
 from unittest.mock import MagicMock
 
 import msgspec
-from support.shard_tables import AGENTS, MEMBERS, S, granted_of, rights_of, table_of
+from support.shard_tables import AGENTS, MEMBERS, S, rights_of, table_of
 
 from swarm.bus.bus import Replied
 from swarm.config.scenario import Scenario
@@ -86,24 +86,6 @@ def test_a_replaced_generation_finds_the_shards_that_keep_its_cells_shut_and_say
     older.hear_known(known)
     (told,) = older.tick({}, S)
     assert (told.state.shard, told.state.ended) == (0, True)
-
-
-def test_a_vehicle_that_waits_in_a_shard_without_a_leader_says_so() -> None:
-    rights = rights_of("a0")
-    rights.begin(0)
-
-    def hear(seq: int, now_ns: int) -> None:
-        table = table_of(1, seq, a0=[0])
-        table.hosts["a0"] = (rights.host.generation, 1)
-        rights.host.hear_granted(granted_of(table), now_ns)
-
-    assert rights.host.unled(S) == {}
-    hear(1, S)
-    assert rights.host.unled(3 * S) == {}
-    (sentence,) = rights.host.unled(4 * S).values()
-    assert all(member in sentence for member in MEMBERS)
-    hear(1, 4 * S)  # told again
-    assert rights.host.unled(5 * S) == {}
 
 
 def test_late_answers_count_for_the_generation_that_asked_only() -> None:

@@ -1,9 +1,7 @@
 """The install of a robot: the client library imports little, quickly, and reads every message without NumPy."""
 
-import os
 import subprocess
 import sys
-from pathlib import Path
 
 from hypothesis import given, settings
 from hypothesis import strategies as st
@@ -15,18 +13,15 @@ from swarm.wire.codec import decode, encode
 from swarm.wire.messages.map_data import MarkSets
 from swarm.wire.route_columns import RouteBatch, Routes
 
-ROOT = Path(__file__).parents[3]
 LARGE = tuple(EXTRAS)
 BLOCKED = f"import sys; sys.modules.update(dict.fromkeys({LARGE!r}))\n"
 """Makes them as good as not installed."""
 
 
-def python(code: str, **environment: str) -> subprocess.CompletedProcess[str]:
-    at_home = {"PYTHONPATH": f"{ROOT}:{ROOT / 'tests'}"}
+def python(code: str, said: str = "") -> subprocess.CompletedProcess[str]:
     return subprocess.run(
-        [sys.executable, "-c", code], env={**os.environ, **at_home, **environment}, capture_output=True, text=True,
-        timeout=60, check=False,
-    )  # fmt: skip
+        [sys.executable, "-c", code], input=said, capture_output=True, text=True, timeout=60, check=False
+    )
 
 
 def test_the_client_imports_nothing_large() -> None:
@@ -49,10 +44,7 @@ def test_without_numpy_every_message_is_read_as_with_it() -> None:
         "    routes = [each.cost_s for each in message.routes] if kind.__name__ == 'RouteReply' else ''\n"
         "    print(encode(message).hex(), routes)\n"
     )
-    done = subprocess.run(
-        [sys.executable, "-c", code], input="\n".join(payloads), capture_output=True, text=True, cwd=ROOT,
-        timeout=60, check=False,
-    )  # fmt: skip
+    done = python(code, "\n".join(payloads))
     assert [line.split()[0] for line in done.stdout.splitlines()] == payloads, done.stderr
 
 

@@ -19,7 +19,7 @@ from swarm.config.scenario_files import (
     with_settings,
 )
 from swarm.config.setting_types import Section
-from swarm.config.vehicle_classes import cost_of_preset, of_class
+from swarm.config.vehicle_classes import of_class
 from swarm.errors import ConfigError
 
 
@@ -209,15 +209,6 @@ def test_a_written_scenario_has_the_same_classes(tmp_path: Path) -> None:
     scenario = load_scenario(tmp_path / "scenario.toml")
     (tmp_path / "again.toml").write_text(scenario_text(scenario, tmp_path))
     assert load_scenario(tmp_path / "again.toml") == scenario
-
-
-def test_classes_keep_the_preset_of_the_common_cost() -> None:
-    scenario = parse_scenario(
-        'cost = { preset = "wheeled" }\nclasses = [{ name = "slow", cost = { vehicle_radius_m = 1 } }]'
-    )
-    cost = of_class(scenario, "slow").cost
-    assert cost.max_slope_deg == cost_of_preset("wheeled").max_slope_deg
-    assert cost.vehicle_radius_m == 1
 
 
 # --- settings by dotted keys: their changes, and the answer to a key that leads nowhere --------------------

@@ -1,24 +1,22 @@
 """An external vehicle's side of right of way, and the bounds that leaders set to external vehicles."""
 
 import math
-from pathlib import Path
 from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
-from msgspec.structs import replace
 
-from swarm.errors import BusError, ConfigError, DamagedError, StoreError
+from swarm.errors import BusError, ConfigError, StoreError
 from swarm.grid import GridSpec
 from swarm.right_of_way import external_session
 from swarm.right_of_way import shard_leader as leaders
 from swarm.right_of_way.external_session import ExternalService, ExternalSession
-from swarm.right_of_way.external_vehicle import ExternalVehicle, Removal
-from swarm.right_of_way.generations import GenerationFile, MemoryGenerations
+from swarm.right_of_way.external_vehicle import ExternalVehicle
+from swarm.right_of_way.generations import MemoryGenerations
 from swarm.right_of_way.shard_leader import Leader
 from swarm.right_of_way.shards import Shards
 from swarm.wire.codec import decode, encode
-from swarm.wire.messages.traffic import Fence, Granted, Held, HostState, Known, Stand, Table
+from swarm.wire.messages.traffic import Held, HostState, Stand, Table
 
 GRID = GridSpec(64, 64, 1.0)
 SHARDS = Shards(GRID, ["a0", "a1", "a2"])
@@ -37,10 +35,6 @@ def entering(name, cell, seq=1, ahead=None, generation=1 << 32):
 
 def state_of(host: str, stands: list[Stand], seq: int, generation: int = 1 << 32) -> HostState:
     return HostState(shard=0, agent=host, generation=generation, seq=seq, knows=(0, 0), vehicles=stands)
-
-
-def known(agent: str, generation: int, shards: list[int], agents: list[str], generations: list[int]) -> Known:
-    return Known(agent=agent, disk=0, generation=generation, shards=shards, agents=agents, generations=generations)
 
 
 def entered(cell: int = 70) -> tuple[ExternalVehicle, Leader]:
@@ -191,76 +185,3 @@ def test_a_shard_knows_a_bounded_number_of_external_vehicles_and_says_which_it_r
     assert set(table.grants) == {"r0-00", "r1-00"}
     leader.take_host_state(state_of("a2", [], seq=1, generation=1), 0)  # of the scenario
     assert len(leader.refused) == 1
-
-
-def test_an_operator_frees_what_all_generations_of_an_external_vehicle_hold_and_the_next_enters() -> None:
-    external, leader = entered()
-    leader._orders.fenced["rover", 77] = {"rover-00": [(90, 1, 1), (91, 1, 1)]}
-    generations = [77, leader._orders.hosts["rover"][0]]
-    removal = Removal(SHARDS, "rover")
-    for agent in SHARDS.agents:
-        removal.hear_known(known(agent, generations[1], [0], list(SHARDS.agents), generations))
-    assert removal.known
-    assert removal.host.informed
-    removal.begin(3)
-    for heartbeat in range(1, 6):
-        now_ns = heartbeat * 300_000_000
-        for told in removal.tick(now_ns):
-            leader.take_host_state(told.state, now_ns)
-        table = leader.tick(now_ns)
-        for granted in leader.granted(table, now_ns):
-            removal.host.hear_granted(granted, now_ns)
-            external.host.hear_granted(granted, now_ns)
-    assert removal.done
-    assert not table.grants
-    assert not table.fences
-    assert external.host.replaced
-    assert external.cells == ()
-
-    back = ExternalVehicle(SHARDS, "rover", [generations[1]])
-    for agent in SHARDS.agents:
-        generation, _ = leader._orders.hosts["rover"]
-        back.host.hear_known(known(agent, generation, [], [], []))
-    back.enter(90)
-    back.begin(9)
-    talk(back, leader, 2_000_000_000)
-    assert back.cells == (90,)
-    table = leader.tick(3_000_000_000)
-    assert table.fences == []  # no vehicle drove by the operator's incarnation
-
-
-def test_a_replaced_external_vehicle_says_nothing_and_takes_nothing() -> None:
-    external, _ = entered()
-    told = Granted(shard=0, host="rover", agent=SHARDS.leader(0, 6), epoch=6, seq=50, generation=1 << 40, heard=0)
-    external.host.hear_granted(told, 5)
-    assert external.host.replaced
-    assert external.tick(6) == []
-    assert external.cells == ()
-
-
-def test_cells_shut_for_an_external_vehicle_are_opened_only_by_a_generation_that_counts() -> None:
-    held = [(70, 1, 1), (71, 1, 1)]
-    leader = leader_of(hosts={"rover": (1 << 40, 9)}, fences=[Fence("rover", 5, {"rover-00": Held.of(held)})])
-    older = entering("rover", 70, generation=1 << 33)
-    leader.take_host_state(replace(older, dead=[5]), 0)
-    assert leader._orders.fenced == {("rover", 5): {"rover-00": held}}
-    leader.take_host_state(entering("a1", 71), 0)
-    younger = entering("rover", 70, generation=(1 << 40) + 1)
-    leader.take_host_state(replace(younger, dead=[5]), 0)
-    table = leader.tick(0)
-    assert [*table.grants["rover-00"]] == [(70, 1, 1)]
-
-
-def test_generations_are_on_file_before_they_speak_and_one_process_has_the_file(tmp_path: Path) -> None:
-    generations = GenerationFile(tmp_path / "deep" / "rover")
-    generations.save([4, 9])
-    with pytest.raises(StoreError, match="is in use"):
-        GenerationFile(tmp_path / "deep" / "rover")
-    generations.close()
-    again = GenerationFile(tmp_path / "deep" / "rover")
-    assert again.generations == [4, 9]
-    again.close()
-    other = tmp_path / "other"
-    other.write_text("4\nnine\n")
-    with pytest.raises(DamagedError, match="is damaged at byte 0: expected a seal of 'generations 1', found b'4"):
-        GenerationFile(other)

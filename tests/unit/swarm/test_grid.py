@@ -88,13 +88,9 @@ def test_a_cell_outside_the_grid_is_a_bug_that_raises(wrong):
             use(wrong)
 
 
-def test_a_walk_off_the_grid_raises():
-    grid = GridSpec(2, 3, 1.0)
-    for start, code in ((0, 0), (2, 2), (5, 4), (3, 6)):  # north, east, south, west
-        with pytest.raises(OutsideGridError):
-            walk(grid, start, bytes([code]))
+def test_a_walk_has_eight_directions():
     with pytest.raises(ValueError, match="code 9"):
-        walk(grid, 0, bytes([9]))
+        walk(GridSpec(2, 3, 1.0), 0, bytes([9]))
 
 
 @pytest.mark.parametrize(

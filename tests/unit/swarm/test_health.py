@@ -15,6 +15,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support.dummy_roles import Idle
 from support.makers import run_info
+from support.processes import eventually
 from support.swarm_model import LossyLinks
 
 from swarm.bus.bus import AskEnded, LinkChanged
@@ -113,31 +114,23 @@ def running(service: Sleepy, health: Health) -> Iterator[None]:
         thread.join(30)
 
 
-def until(board: Board, holds) -> Vitals:
-    """The record of a board once a condition holds."""
-    deadline_s = time.monotonic() + 30
-    while (found := board.read()) is None or not holds(found):
-        assert time.monotonic() < deadline_s, found
-        time.sleep(0.01)
-    return found
-
-
 def test_a_loop_that_hangs_is_seen_from_another_thread(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(loop_health, "HUNG_S", 0.5)
     service, health = Sleepy(), Health()
-    assert health.board.read().phase is Phase.STARTS
+    told = health.board.read
+    assert told().phase is Phase.STARTS
     with running(service, health):
-        found = until(health.board, lambda each: each.phase is Phase.RUNS)
-        assert found.lacks == ("a bed",)
+        eventually(lambda: told().phase is Phase.RUNS, 30, "a loop that runs")
+        assert told().lacks == ("a bed",)
         service.needs = []
-        until(health.board, lambda each: not each.lacks)
+        eventually(lambda: not told().lacks, 30, "a loop that lacks nothing")
         service.hang.set()
-        until(health.board, lambda each: each.hangs(time.monotonic_ns()))
+        eventually(lambda: told().hangs(time.monotonic_ns()), 30, "a loop that hangs")
         service.hang.clear()
         service.wake.set()
-        until(health.board, lambda each: not each.hangs(time.monotonic_ns()))
-    assert health.board.read().phase is Phase.ENDS
-    assert not health.board.read().hangs(1 << 62), "what ends does not turn, and does not hang"
+        eventually(lambda: not told().hangs(time.monotonic_ns()), 30, "a loop that turns again")
+    assert told().phase is Phase.ENDS
+    assert not told().hangs(1 << 62), "what ends does not turn, and does not hang"
 
 
 @pytest.fixture

@@ -6,7 +6,7 @@ from support.shard_tables import GRID, MEMBERS, SHARDS, S, entries, granted_of, 
 
 from swarm.right_of_way.generations import HEARTBEAT_NS
 from swarm.right_of_way.holdings import CellRequest, Holdings
-from swarm.wire.messages.traffic import Entry, Left
+from swarm.wire.messages.traffic import Left
 from swarm.wire.topics import HOST_STATE
 
 
@@ -35,21 +35,6 @@ def test_a_host_takes_what_follows_its_path(holdings: Holdings) -> None:
     assert list(holdings.path("a0-00")) == [9]
     hear(holdings, table_of(1, 2, a0=[9, *entries(1, 2, 10, 20)]))
     assert list(holdings.path("a0-00")) == [9, 10]  # 20 does not follow
-
-
-def test_an_entry_given_back_is_not_taken_again_and_another_of_the_same_cell_is(holdings: Holdings) -> None:
-    hear(holdings, table_of(1, 1, a0=[9]))
-    hear(holdings, table_of(1, 2, a0=[9, *entries(1, 2, 10, 11)]))
-    holdings.give_back("a0-00")
-    requests = [{"a0-00": CellRequest(ahead=[10, 11], wants=[10, 17, 1], better=2)} for _ in range(2)]
-    (told,) = holdings.host_states(requests[0], S)
-    said = told.state
-    assert holdings.host_states(requests[1], S + HEARTBEAT_NS - 1) == []
-    assert ([*said.vehicles[0].holds], said.vehicles[0].ahead) == ([(9, 1, 1)], [10, 11])
-    hear(holdings, table_of(1, 3, a0=[9, *entries(1, 2, 10, 11)]))  # it has not heard that yet
-    assert list(holdings.path("a0-00")) == [9]
-    hear(holdings, table_of(1, 4, a0=[9, (10, 1, 4)]))
-    assert list(holdings.path("a0-00")) == [9, 10]
 
 
 def test_a_host_gives_back_what_another_waits_for_far_ahead_and_says_so_at_once(holdings: Holdings) -> None:
@@ -87,24 +72,6 @@ def test_to_have_driven_on_is_no_news_until_another_waits_or_little_is_left(hold
     assert held_by_word() == cells[5:]
 
 
-def test_a_vehicle_follows_on_the_word_of_the_host_that_was_before_it_and_of_no_other(holdings: Holdings) -> None:
-    hear(holdings, table_of(1, 1, a0=[9]))
-    waits = Entry((10, 1, 2), [(1, 1, "a1-00")])
-    table = table_of(1, 2, a0=[9, waits.number])
-    granted = msgspec.structs.replace(granted_of(table), waits={"a0-00": [waits]})
-    holdings.hear_granted(granted, S)
-    assert (holdings.path("a0-00"), holdings.open("a0-00")) == ([9, 10], [9])
-    with pytest.raises(ValueError, match="must not enter cell 10"):
-        holdings.moved("a0-00", 10)
-    for host, number in (("a2", (10, 1, 1)), ("a1", (10, 1, 3)), ("a1", (11, 1, 1))):
-        holdings.hear_left(Left(agent=host, host="a0", entries=[number]))
-        assert not holdings.may_enter("a0-00", 10)
-    holdings.hear_left(Left(agent="a1", host="a0", entries=[(10, 1, 1)]))
-    assert holdings.open("a0-00") == [9, 10]
-    holdings.moved("a0-00", 10)
-    assert holdings.path("a0-00") == [10]
-
-
 def test_a_host_says_what_it_has_left_to_those_who_follow_until_a_table_lists_it_no_more() -> None:
     holdings = holdings_of()
     hear(holdings, table_of(1, 1, a0=[9, 10]))
@@ -116,18 +83,6 @@ def test_a_host_says_what_it_has_left_to_those_who_follow_until_a_table_lists_it
     assert [holdings.lefts(now_ns) for now_ns in (S, S + 1, S + HEARTBEAT_NS)] == [[word], [], [word]]
     hear(holdings, table_of(1, 3, a0=[10]))
     assert holdings.lefts(9 * S) == []
-
-
-def test_the_older_of_two_generations_learns_that_it_is_replaced(holdings: Holdings) -> None:
-    """Even by changes since a table that only the younger one has used."""
-    table = table_of(1, 2, a0=[9])
-    table.hosts["a0"] = (2, 1)
-    holdings.hear_granted(msgspec.structs.replace(granted_of(table), since=(1, 1)), 0)
-    assert holdings.replaced
-    assert list(holdings.path("a0-00")) == []
-    hear(holdings, table_of(1, 3, a0=[9]), S)  # late: it places no vehicle
-    assert list(holdings.path("a0-00")) == []
-    assert all(told.state.ended for told in holdings.host_states({}, S))
 
 
 def test_a_host_speaks_to_the_leader_that_it_hears_and_else_to_all_members(holdings: Holdings) -> None:
@@ -146,12 +101,3 @@ def test_cells_from_nowhere_are_not_driven_to(lie: list[int], holdings: Holdings
     hear(holdings, table_of(1, 1, a0=lie))
     hear(holdings, table_of(1, 2, a0=[*lie, -16]))
     assert all(0 <= cell < GRID.cells for cell in holdings.path("a0-00"))
-
-
-def test_a_host_is_gone_once_it_holds_and_requests_nothing_and_every_leader_knows_it(holdings: Holdings) -> None:
-    hear(holdings, table_of(1, 1, a0=[9]))
-    assert not holdings.gone
-    holdings.watched.clear()
-    assert not holdings.gone, "a vehicle still has a path"
-    holdings.leave("a0-00")
-    assert holdings.gone

@@ -5,14 +5,14 @@ from unittest.mock import Mock
 
 import pytest
 
-from swarm.bus.bus import Asked, AskEnded, Heard, Replied
+from swarm.bus.bus import Asked, AskEnded, Heard
 from swarm.clock import NS_PER_S
 from swarm.config.scenario import Scenario
-from swarm.runtime.order_book import GoalBook, OrderClient
+from swarm.runtime.order_book import OrderClient
 from swarm.runtime.role_setup import RoleSetup
 from swarm.wire.messages import Nothing
-from swarm.wire.messages.orders import Goals, Obey, Order, Orders, VehicleGoals
-from swarm.wire.topics import GOALS, OBEYED, ORDERS
+from swarm.wire.messages.orders import Obey, Order, Orders
+from swarm.wire.topics import OBEYED, ORDERS
 
 PAUSE = Order(subject="pause", name="", stamp_ns=7)
 
@@ -47,30 +47,6 @@ def test_a_process_asks_keepers_twice_and_then_all_four_times_a_second_until_it_
         assert client.known == (len(at_ns) == times)
     assert at_ns == [n * NS_PER_S // 4 for n in range(times)]
     assert [call.kwargs.get("role") for call in bus.ask.call_args_list] == ["keeper"] * 2 + [None] * (times - 2)
-
-
-def test_an_agent_waits_for_its_goals_too_and_answers_an_operator_once_it_has_them(bus: Mock) -> None:
-    goals = GoalBook()
-    client = client_on(bus, goals=goals)
-    client.start(0)
-    client.tick(NS_PER_S)
-    assert [call.args[0].name for call in bus.ask.call_args_list] == ["goals", "orders"], "both are open"
-    assert [call.args[0] for call in bus.subscribe.call_args_list] == [ORDERS, GOALS]
-    client.on_order_event(Heard(ORDERS, {}, Orders(role="keeper", id="0", orders=[PAUSE])), 1)
-    assert not client.known
-    order = Obey(subject="vehicle", name="a0-00", stamp_ns=5, goals=True)
-    waits, of_waits = asked(OBEYED, order)
-    client.on_order_event(waits, 1)
-    client.on_order_event(AskEnded("orders", ORDERS, 1, None), 1)
-    client.tick(2 * NS_PER_S)
-    assert bus.ask.call_count == 2, "the other question is open"
-    sent = VehicleGoals(name="a0-00", stamp_ns=5, cells=[7])
-    client.on_order_event(Replied("goals", GOALS, {}, Goals(id="0", agent="a0", goals=[sent], shared=[(7, 2)])), 2)
-    assert client.known
-    assert list(goals) == [sent]
-    assert client.shared == {7: 2}
-    client.tick(3 * NS_PER_S)
-    assert of_waits.answer.called
 
 
 def test_a_process_tells_its_orders_to_others_once_it_knows_them(bus: Mock) -> None:

@@ -6,25 +6,13 @@ from collections.abc import Callable
 from hypothesis import given
 from hypothesis import strategies as st
 from msgspec.structs import replace
-from support.shard_tables import GRID, SHARDS, S, cells_of, entries, holdings_of, host_state, table_of
+from support.shard_tables import GRID, SHARDS, cells_of, entries, host_state, table_of
 
 from swarm.right_of_way.cell_orders import Orders
 from swarm.right_of_way.generations import HEARTBEAT_NS, first_generation, is_far_ahead
 from swarm.right_of_way.pibt import Mover, Round
 from swarm.right_of_way.shard_leader import Leader
 from swarm.wire.messages.traffic import Held, Stand
-
-
-def test_a_cell_is_free_again_only_by_the_word_of_its_host() -> None:
-    leader = Leader(SHARDS, "a0", 3, table_of(1, 1, a1=[9, 10, (11, 1, 2)]), {"a1": ["a1-00"]})
-    assert cells_of(leader.tick(0), "a1-00") == [9, 10, 11]
-    leader.take_host_state(host_state("a1", entries(1, 1, 10), seq=2, knows=(1, 1)), 0)
-    assert cells_of(leader.tick(S), "a1-00") == [10, 11]
-    leader.take_host_state(host_state("a1", entries(1, 1, 9, 10), seq=1), 0)  # late
-    leader.take_host_state(host_state("a1", entries(1, 1, 10), seq=3, knows=(1, 1)), 0)  # of before the last grant
-    assert cells_of(leader.tick(2 * S), "a1-00") == [10, 11]
-    leader.take_host_state(host_state("a1", entries(1, 1, 10), seq=4, knows=(1, 2)), 0)
-    assert cells_of(leader.tick(3 * S), "a1-00") == [10]
 
 
 def test_entries_of_a_table_are_ordered_by_epoch_and_then_by_number() -> None:
@@ -39,50 +27,6 @@ def test_a_table_adds_one_entry_to_a_cell_at_most_so_that_its_number_is_used_onc
     assert orders.order(10) == {(10, 1, 2): "a1-00"}
     assert orders.append("a2-00", 10, (1, 3))
     assert list(orders.order(10).values()) == ["a1-00", "a2-00"]
-
-
-def test_entries_of_an_older_generation_stay_until_it_has_stopped_or_is_proved_dead() -> None:
-    nine = entries(1, 1, 9)
-    for end in (
-        host_state("a1", nine, seq=9, ended=True),
-        host_state("a1", nine, seq=9, generation=1 << 33, dead=[1]),
-    ):
-        leader = Leader(SHARDS, "a0", 3, table_of(1, 1, a1=[9, 10]), {"a1": ["a1-00"]})
-        leader.take_host_state(host_state("a1", nine, seq=1, generation=1 << 32, vehicles=[]), 0)
-        table = leader.tick(0)
-        assert [(each.agent, each.generation, each.entries) for each in table.fences] == [
-            ("a1", 1, {"a1-00": Held.of(entries(1, 1, 9, 10))})
-        ]
-        assert [*table.grants["a1-00"]] == [(9, 3, 2)]  # a new one, behind that of the older generation
-        leader.take_host_state(end, 0)
-        assert all(each.generation != 1 for each in leader.tick(S).fences)  # type: ignore[union-attr]
-
-
-def test_the_entry_of_a_body_passes_to_the_generation_that_proves_the_older_one_ended() -> None:
-    for dead, cells in (([1], [(10, 1, 1)]), ([], [])):
-        leader = Leader(SHARDS, "a0", 3, table_of(1, 1, rover=[9, 10]), {"a1": ["a1-00"]})
-        stands = Stand("rover-00", 10, 10, Held(), [10], [], 0, 0)
-        leader.take_host_state(
-            host_state("rover", [(10, 0, 0)], 1, generation=1 << 32, dead=dead, vehicles=[stands]), 0
-        )
-        table = leader.tick(0)
-        assert [*table.grants.get("rover-00", [])] == cells
-
-
-def test_an_older_generation_is_told_that_it_is_replaced_by_a_leader_that_never_heard_the_younger() -> None:
-    """The younger has died, and the leader knows of it by the table only."""
-    table = table_of(1, 1, a1=[9])
-    table.hosts["a1"] = (2 << 32, 7)
-    leader = Leader(SHARDS, "a0", 3, table, {"a1": ["a1-00"]})
-    for late in (host_state("a1", [(9, 1, 1)], seq=50), host_state("a1", [(9, 1, 1)], seq=51, ended=True)):
-        leader.take_host_state(late, S)
-        told = leader.tick(S)
-        (granted,) = leader.granted(table if told is None else told, S)
-        assert (granted.host, granted.generation) == ("a1", 2 << 32)
-        leader = Leader(SHARDS, "a0", 3, table, {"a1": ["a1-00"]})
-    older = holdings_of("a1", ["a1-00"])
-    older.hear_granted(granted, S)
-    assert older.replaced
 
 
 def test_a_generation_that_is_implausibly_far_ahead_is_refused_and_named() -> None:

@@ -107,13 +107,6 @@ def test_a_grid_whose_larger_shards_have_no_numbers_is_refused() -> None:
         Shards(grid, (), 3 * REGION_CELLS)
 
 
-def test_an_agent_with_a_wrong_size_that_no_one_built_on_may_start_again_with_the_right_one() -> None:
-    spawns = {agent: {f"{agent}-00": n} for n, agent in enumerate(("a0", "a1", "a2"))}
-    wrong = RightOfWay("a0", Shards(GRID, list(spawns), LARGE), spawns, OwnRecord(disk=1), {})
-    (own,) = wrong.begin(5)
-    assert RightOfWay("a0", Shards(GRID, list(spawns), SMALL), spawns, own, {}).own.shard_cells == SMALL
-
-
 @pytest.mark.parametrize("order", [(SMALL, LARGE, LARGE, LARGE), (LARGE, LARGE, SMALL, LARGE)])
 def test_an_external_vehicle_goes_by_the_largest_shards_that_it_is_told_of(order: tuple[int, ...]) -> None:
     """Agents tell an external vehicle of larger ones only if the whole run has them."""

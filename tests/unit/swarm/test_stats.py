@@ -55,13 +55,6 @@ def test_nothing_counted_has_no_quantile_and_no_mean():
     assert merged([]).count == 0
 
 
-def test_zero_sorts_below_everything():
-    one = histogram([0.0, -3.0, 5e-324, 1.0])
-    assert one.quantile(0.0) == 0.0
-    assert one.quantile(0.49) == 0.0
-    assert one.quantile(1.0) == 1.0
-
-
 def test_counters_count_gauge_and_observe():
     counters = Counters()
     counters.count("marks")

@@ -8,10 +8,8 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from swarm.errors import ProtocolError
-from swarm.peers import Peer
 from swarm.wire import fields
-from swarm.wire.topics import FLEET, KNOWN, MARKS, POSE, TOPICS, peer_of
+from swarm.wire.topics import FLEET, KNOWN, MARKS, POSE, TOPICS
 
 chunks = st.text("abzAZ09_.-", min_size=1, max_size=12)
 topics = st.sampled_from(TOPICS)
@@ -113,21 +111,3 @@ for topic in topics.TOPICS:
                 pass
 """
     subprocess.run([sys.executable, "-c", program], check=True)
-
-
-def test_a_token_names_a_process_or_is_refused_and_never_raises_anything_else() -> None:
-    assert peer_of("swarm/alive/agent/a0/17") == Peer("agent", "a0", 17)
-    # Python refuses an int of 5000 digits, and \u0663 is a digit to it.
-    for incarnation in ("9" * 5000, "9" * 19, str(1 << 62), "\u0663\u0663", "-1", "", "1.5", "x", "1/2"):
-        with pytest.raises(ProtocolError):
-            peer_of(f"swarm/alive/agent/a0/{incarnation}")
-    for key in (
-        "a/b",
-        "",
-        "alive",
-        "swarm/alive/a b/a0/1",
-        "swarm/alive/agent//1",
-        f"swarm/alive/agent/{'x' * 65}/1",
-    ):
-        with pytest.raises(ProtocolError):
-            peer_of(key)
