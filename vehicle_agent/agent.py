@@ -164,9 +164,10 @@ class Agent:
         self.assignment.ask_soon(now_ns)
 
     def follow_goals(self, shared: Mapping[int, int], now_ns: int) -> None:
-        """Sends vehicles where the book of `goals` says, and recalls them. Called in each tick.
+        """Sends vehicles to their places in the book of `goals`, and recalls those which have none there any more.
+        Called in each tick.
 
-        shared  as in `GoalQueues`
+        shared  cell -> how many vehicles of all agents were sent there, as in `GoalQueues`
         """
         goals = self.goals
         if shared != goals.shared or now_ns >= self._look_due_ns:
@@ -267,7 +268,7 @@ class Agent:
 
     @property
     def cell_requests(self) -> Mapping[str, CellRequest]:
-        """Requests to leaders for each vehicle, as of the last `decide`."""
+        """Vehicle -> the cells that it requests from leaders, as of the last `decide`."""
         return self._cell_requests.of
 
     @property

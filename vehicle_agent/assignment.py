@@ -91,10 +91,11 @@ class Cheapest:
 
 
 class Balanced:
-    """First every target's pursuers out of the whole group, then even shares: see `need_first` and `spread`.
+    """Gives each target its number of pursuers from the whole group (`need_first`), then spreads the other vehicles
+    evenly (`spread`).
 
-    All agents solve the same problem, independent of message order, and each applies its own vehicles' part. If
-    they hold different messages, a target may have more pursuers for a period.
+    All agents solve the same problem, independent of message order, and each applies the part for its own vehicles.
+    If they have received different messages, a target may have more pursuers for a period.
     """
 
     shares_costs = True

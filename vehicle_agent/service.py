@@ -257,7 +257,7 @@ class AgentService(MemberService):
             self.when_over()
 
     def _wait_longer(self, failure: str | None) -> None:
-        """A query has ended. If its answer came too late, or not at all, the next is waited for twice as long."""
+        """Notes that a query has ended. After a timeout the next query may wait twice as long for its answer."""
         if failure == "timeout":
             self._answer_s = min(2 * self._answer_s, _LONGEST_ANSWER_S)
 

@@ -222,8 +222,8 @@ class Assignment:
             self._costs_s[target] = costs_s
 
     def all_given(self, planners: Collection[str]) -> bool:
-        """True if these planners, which live, have all answered the open request. Its end may be seconds later,
-        where a message was lost."""
+        """Returns True if all these planners, which live, have answered the open request. If a message was lost,
+        the request may end seconds later."""
         return self._open is not None and have_answered(self._costs_s, self.targets, planners)
 
     def costs_ended(

@@ -52,18 +52,18 @@ class RightOfWay:
     """Right of way of one agent.
 
     spawns    agent -> vehicle -> the cell where it stands when the run begins
-    own       what this agent's file holds: of itself,
-    saved     and of shards: (promised epoch, stored table)
-    vehicles  of an agent that is not in `spawns`, an external vehicle: it has no seat, and its vehicles enter one
-              by one
-    tick_ns   between two ticks
+    own       the agent's record about itself, from its file
+    saved     shard -> (promised epoch, stored table), from the same file
+    vehicles  only for an external vehicle, which is not in `spawns`: its vehicles, which enter one by one. It has
+              no seat
+    tick_ns   time between two ticks
 
-    host    our part as a host of vehicles
+    host    the agent's part as a host of vehicles
     trips   round trips to the other agents
-    silent  whether our file cannot be written now: then we are no member of any shard, and note no other agent's
-            file. Our vehicles' held and granted cells do not depend on it
+    silent  whether the file cannot be written now: then the agent is no member of any shard, and notes no other
+            agent's file. The held and granted cells of its vehicles do not depend on it
 
-    Raises StoreError if the file holds promises of shards of another size: the same cells would be granted twice.
+    Raises StoreError if the file holds promises for shards of another size: cells could be granted twice.
     """
 
     agent: str

@@ -283,8 +283,8 @@ class RightOfWaySync:
         self.bus.ask(KNOWN, request, self.post, tag=self._known_tag, timeout_s=_LATE_ANSWERS_S)
 
     def _begin(self) -> None:
-        """Begins a generation if there is none, once those who could be asked had time to answer and the promise
-        file can be written."""
+        """Begins a generation if there is none and the promise file can be written. Called once the other agents
+        have had time to answer."""
         self.core.silent = not self.store.ready
         if self._asked_ns is not None and not self.core.host.generation and not self.core.silent:
             self._perform(self.core.begin(self._chance))

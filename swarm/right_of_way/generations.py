@@ -27,7 +27,7 @@ _FURTHEST_GENERATION = 1 << 16
 
 
 def is_said(says: object, told: object, age_ns: int, again_ns: int = HEARTBEAT_NS) -> bool:
-    """Returns True if the same was told a time ago after which it need not be repeated."""
+    """Returns True if the same was told so recently that it need not be repeated yet."""
     return says == told and 0 <= age_ns < again_ns
 
 

@@ -221,7 +221,7 @@ class Holdings:
         return any(entry.number in self._followed for entry in self._entries.paths[vehicle][:1])
 
     def open(self, vehicle: str) -> Sequence[int]:
-        """The first cells of a path, up to the first that the vehicle may not enter yet."""
+        """Returns the cells of a vehicle's path before the first one that it may not enter yet."""
         path, entries = self.path(vehicle), self._entries.paths.get(vehicle, [])
         if not any(entry.after for entry in entries):
             return path
@@ -430,7 +430,7 @@ class Holdings:
         ]
 
     def _say_entering(self, by_shard: dict[int, dict[str, _Told]], shard: int, stand: Stand) -> None:
-        """States what a vehicle that is nowhere has and wants of a shard."""
+        """Adds a vehicle which is in no cell yet to the statements for a shard."""
         by_shard.setdefault(shard, {})[stand.vehicle] = stand, stand
         self._views.setdefault(shard, _View()).same = False
 

@@ -167,7 +167,7 @@ class Member:
         return max(LEASE_NS, HEARTBEAT_NS + 2 * (self._trips.bound_ns(self._trusted) + self._tick_ns))
 
     def _turn_ns(self) -> int:
-        """Time by which this member claims later than the first: that one's claim arrives before."""
+        """Returns the delay of this member's claim, by rank: the claim of a lower rank arrives before it is due."""
         return self._rank * max(_RANK_NS, self._trips.bound_ns(self._trusted) + self._tick_ns)
 
     def _ask(self, stamp: Stamp, now_ns: int) -> None:

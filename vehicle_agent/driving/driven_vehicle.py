@@ -28,12 +28,12 @@ _LEAST_PART = 1e-9
 
 
 class Follower:
-    """The cells of a vehicle's route and how far along it the vehicle is. Without a route no cell is ahead. Not the
-    `Follower` of `planner_service.followers`, a vehicle as its planner knows it.
+    """The cells of a vehicle's route and how far along it the vehicle is. Without a route no cell is ahead.
+    `Follower` of `planner_service.followers` is another class: a vehicle as its planner knows it.
 
     left     how many cells are ahead
     changes  how often the route was begun, dropped or cut
-    version  changes of the route or of the vehicle's progress
+    version  number of changes of the route or of the vehicle's progress
     """
 
     def __init__(self) -> None:
@@ -54,7 +54,7 @@ class Follower:
         """Follows a route from the first cell of the vehicle's path that lies on the route. Returns False, and
         changes nothing, if none does.
 
-        turns  for a pulled route: indices of the cells in which it turns, first and last included
+        turns  for an any-angle route: indices of the cells in which it turns, first and last included
         """
         at = next((cells.index(cell) for cell in path if cell in cells), None)
         if at is None:
@@ -210,12 +210,12 @@ class Reason(enum.Enum):
 class GivenRoute(msgspec.Struct, frozen=True):
     """A route from a planner, requested or pushed.
 
-    cells          the first is where the planner took the vehicle to be
+    cells          from the cell in which the planner assumed the vehicle
     cost_s         its cost, in seconds
     lower_bound_s  proven lower bound of the cost of any route
     partial        whether it ends before the target
     searching      whether it leads to a cell where the unseen target may be
-    turns          for a pulled route: indices of the cells in which it turns, first and last included
+    turns          for an any-angle route: indices of the cells in which it turns, first and last included
     """
 
     target: str
@@ -387,7 +387,7 @@ class Vehicle:
         self._settle()
 
     def no_answer(self, now_ns: int) -> None:
-        """Notes that a request ended without a usable route: the next one waits longer each time."""
+        """Notes that a request ended without a usable route. The wait before the next one grows each time."""
         self.asked = None
         self._ask_later(now_ns)
         self._settle()

@@ -37,11 +37,11 @@ class DynamicsWorld:
 
 @dataclass(frozen=True, slots=True)
 class Stretch:
-    """The next piece of driving: to the border or the middle of a cell, at most.
+    """The next piece of driving, which ends at the border or the middle of a cell at the latest.
 
     vehicle        its id
     speed_m_per_s  how fast it was at the end of the last tick; 0 if it stood
-    limit_m_per_s  how fast the ground allows it to be
+    limit_m_per_s  highest speed that the ground allows
     turn_rad       by how much it has turned since the last stretch, -pi to pi, clockwise
     ahead_m        metres to the end of the cells that it was granted, where it stops unless more are granted
     tick_s         seconds on the terrain from one tick to the next
@@ -101,7 +101,7 @@ class Dynamics(Protocol):
     """Decides the speed of vehicles. A plug-in is made as `Name(world: DynamicsWorld, options)`."""
 
     def speed(self, stretch: Stretch) -> float:
-        """m/s on this stretch; more than the limit is cut to that, 0 stands still."""
+        """Returns the speed on this stretch, in m/s; 0 stands still. More than the limit is cut to the limit."""
         ...
 
 

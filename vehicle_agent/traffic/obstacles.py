@@ -221,7 +221,7 @@ class Obstacles:
 
     @property
     def closed(self) -> Container[int]:
-        """The cells that no vehicle may enter; one object for good, which changes with `take_report` and `tick`."""
+        """The cells that no vehicle may enter: always the same object, which `take_report` and `tick` change."""
         return self._closed
 
     @property
