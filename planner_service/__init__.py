@@ -3,21 +3,24 @@
 Every route of a planner leads over passable cells of the map as the planner knows it. It states a proven lower
 bound of the cost of any route. The planner ensures this in six steps:
 
-1. *Map.* Marks come in by replication; the cost map says which windows have changed (`service`, `planner`).
-2. *Intake.* Changes that no follower's route passes wait for a second at most (`followers.MapIntake`).
-3. *Repair.* Costs that have risen detach what hung on them, costs that have fallen spread (`kernels.repair`).
+1. *Map.* Marks arrive by replication; the cost map reports which windows have changed (`service`, `planner`).
+2. *Intake.* A follower is a vehicle on a route to the target. Changes that no follower's route passes wait for a
+   second at most (`followers.MapIntake`).
+3. *Repair.* Where costs have risen, the subtrees behind are detached and joined again. Lower costs spread
+   (`kernels.repair`).
 4. *Move.* The tree is led to the target's new cell: a window around it is grown, then, under an exact strategy, all
    costs are made exact by the parents (`kernels.costs_from_parents`, or `kernels.tile_pieces` on large maps). If
-   that takes too long for the thread that answers, a worker searches the whole tree. `target_tree.Decision` is the
-   decision, by the row of the strategy (`strategy`) and by the times of searches (`growth_times`).
-5. *Certificate.* An exact tree bounds itself. Otherwise the last exact costs are a consistent heuristic, lowered
-   with the map, and the last window adds its rim (`tree.route_bounds`, docs/method/certificates.md).
-6. *Push.* A follower is pushed another route if its route passes a change or begins in a grown part, and the
-   other differs.
+   that takes too long for the thread that replies, a worker searches the whole tree. `target_tree.Decision` chooses
+   by the row of the strategy (`strategy`) and by the times of searches (`growth_times`).
+5. *Bound.* The costs of an exact tree are their own bounds. Otherwise the last exact costs are a consistent
+   heuristic, lowered with the map, and the last window adds its rim (`tree.route_bounds`,
+   docs/method/certificates.md).
+6. *Push.* A follower gets a new route if its old one passes a change or begins in a grown part, and the new one
+   differs.
 
-The walk from a pose to a pushed route. `PlannerService.tick` calls steps 1 and 4, and 10 through `_perform`; each
-other step is called by an earlier one. Values are returned; no step calls back. The bus and the codec precede
-step 1.
+These are the calls from a pose to a pushed route. `PlannerService.tick` calls steps 1 and 4, and step 10 through
+`_perform`; each other step is called by an earlier one. Values are returned; no step calls back. The bus and the
+codec come before step 1.
 
 1. `service.py`: `_take_collected` takes the poses since the last tick from the bus.
 2. `tracker_notes.py`: `TargetWatch.on_pose` stores the pose if it counts, and reports oddities.
@@ -47,8 +50,8 @@ standby       as above, but it pushes nothing                 the leader falls s
                                                               to every follower
 ============  ==============================================  =====================================================
 
-The tree's own states are `target_tree.State`; `target_search` holds whether a search runs, the candidacy
-which process leads. The same without a process, a network or a file:
+The tree's own states are `target_tree.State`. `target_search` knows if a search for the target runs; the candidacy
+(`planning_process`) knows which process leads. `RouteFinder` plans without a process, a network or a file:
 
 >>> import numpy as np
 >>> from planner_service import RouteFinder

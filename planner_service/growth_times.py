@@ -175,7 +175,7 @@ class GrowthTimes:
         self._choose()
 
     def observe_exact_ns(self, took_ns: int) -> None:
-        """CPU time (ns) of an exact update, without the preceding repair."""
+        """Records the CPU time (ns) of an exact update, without the preceding repair."""
         if not self._exact_took_ns:  # one slow move, such as the first after a growth, gives up no tree
             self._exact_took_ns.extend([int(self.exact_ns)] * 2)
         self.exact_ns = max(1, _median_with(self._exact_took_ns, took_ns))

@@ -197,7 +197,7 @@ class _ClassTrees:
 
 
 class PlacesService(PlanningProcess):
-    """Serves routes between any two cells. The process is named after the first group that it serves."""
+    """Serves routes between any two cells. The process has the name of the first group that it serves."""
 
     def __init__(self, planning: Planning, all_kernels: Callable[[], bool] | None = None) -> None:
         job, scenario = job_of(planning.setup.id), planning.setup.scenario

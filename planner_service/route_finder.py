@@ -233,8 +233,8 @@ def _check_type(name: str, value: object, kind: Any) -> None:
 
 
 def _whole(place: Any) -> tuple[int, int]:
-    """A place as a cell. Raises ArgumentError if row or column is not whole, as half a row may be half a map away,
-    or has more than 64 bits."""
+    """A place as (row, col). Raises ArgumentError unless both are whole numbers of at most 64 bits. Nothing is
+    rounded: the next row may lie on the other side of a wall."""
     try:
         row, col = map(int, np.array([whole("row or column", each) for each in place], np.int64))
     except (TypeError, ValueError, OverflowError) as error:

@@ -56,7 +56,7 @@ class Blocks:
 
     @property
     def middles(self) -> NDArray[np.int64]:
-        """int64 (rows * cols,): the cell of the grid that is nearest to the middle of each block."""
+        """The cell of the grid that is nearest to the middle of each block, int64 (rows * cols,)."""
         rows, cols = (
             np.minimum(np.arange(many) * self.side_cells + self.side_cells // 2, last)
             for many, last in zip(self.shape, (self.grid.rows - 1, self.grid.cols - 1), strict=True)

@@ -144,9 +144,9 @@ class LearnedKind(NamedTuple):
     """State of one kind of ground.
 
     kind            its class and its slopes in degrees, such as `forest 10-15`
-    cells           driven cells, as all authors say together
-    authors         processes that have driven there
-    measured        driven over prior pace, geometric mean of what counts
+    cells           number of driven cells, all authors together
+    authors         number of processes that have driven there
+    measured        ratio of driven to prior pace, as `estimate` combines those of the authors
     standard_error  of ln(measured)
     factor          what the prior pace is multiplied by
     """

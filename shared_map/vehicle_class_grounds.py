@@ -445,8 +445,8 @@ class ClassMaps:
         paces: NDArray[np.float32],
         class_number: int = 0,
     ) -> None:
-        """Like `CostMap.apply`: a mark for all vehicles changes each map as its class reads it, a mark for one
-        class its map. A class that has no map here is not affected."""
+        """Applies marks as `CostMap.apply` does. A mark for all vehicles changes the map of each class, in the way
+        that the class reads it. A mark for one class changes only its map, if there is one here."""
         if class_number == 0:
             self.common.apply(cells, kinds, paces)
             if not self.of:

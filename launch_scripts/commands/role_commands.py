@@ -181,7 +181,7 @@ def run_role(
 
 
 def _health_of(name: str, part: Part) -> Health:
-    """Returns the health reports of the role: to its supervisor, and to probes if they have a port."""
+    """Returns the health of the role. Its supervisor can read it; probes can, too, if there is a health port."""
     from launch_scripts.web.health_pages import Process, health_pages
     from launch_scripts.web.http_server import Server
     from swarm.runtime.loop_health import Health, supervisor_of

@@ -134,10 +134,11 @@ def ask_place(bus: Bus, where: Where, start: Place, end: Place, vehicle_class: s
 
 
 def _reply(bus: Bus, topic: Topic, request: Message, kind: type[M], server: str, missing: str, **fields: Any) -> M:
-    """The reply of this kind to a question. Raises ConfigError if it is refused, BusError(missing) without one.
+    """The reply of this kind to a query. Raises ConfigError if the query is refused, BusError(missing) if no
+    process replies.
 
-    server  the name of the process that answers; `*` stands for any id. If the run needs one, the question is
-            repeated: a standby, or the next life, may be about to take over
+    server  the name of the process that replies; `*` stands for any id. If the run has such a process, the query is
+            repeated: a standby, or the restarted process, may be about to take over
     """
     asker, until_s = asker_of(OPERATOR, "command"), time.monotonic() + _TIMEOUT_S
     while True:

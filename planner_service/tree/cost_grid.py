@@ -171,8 +171,8 @@ class CostGrid:
         return scratch
 
     def check_root(self, cell: int) -> None:
-        """Raises OutsideGridError unless the cell is one of the grid, ValueError where it is lethal: no tree leads
-        there, and kernels check no index."""
+        """Raises OutsideGridError if the cell is not in the grid, because kernels check no index. Raises ValueError
+        if it is lethal, because no tree leads there."""
         if not self.passable(cell):
             raise ValueError(f"cell {cell} is lethal: no tree can lead there")
 

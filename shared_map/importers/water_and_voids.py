@@ -436,7 +436,7 @@ def undeclared_voids(
 
 
 def voids_as_nan(heights: Floats, voids: Sequence[float]) -> Floats:
-    """Heights as stored, with NaN for each value that stands for no height."""
+    """The stored heights, with NaN in place of each value that means "no data"."""
     if not voids:  # as in most files: no copy
         return heights
     return np.where(np.isin(heights, np.array(voids, np.float32)), np.float32(np.nan), heights)

@@ -127,7 +127,7 @@ class KeeperStore(SealedDatabase):
         return {each.author: each for each in self._sets(_FOLDED, "WHERE tile = ?", tile)}
 
     def tiles_set_aside(self) -> list[int]:
-        """Tiles of which compaction dropped something, in order."""
+        """Tiles with marks that compaction dropped, in ascending order."""
         with self._reading():
             return [row[0] for row in self._db.execute("SELECT DISTINCT tile FROM folded ORDER BY tile")]
 

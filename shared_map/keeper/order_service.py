@@ -201,7 +201,7 @@ class KeptOrders:
         return order
 
     def _placed(self, given: orders.GiveOrder) -> orders.GiveOrder:
-        """With a cell for a place, or for row and column. Raises ConfigError outside the grid."""
+        """The order with its place, or its row and column, as a cell. Raises ConfigError outside the grid."""
         at = given.at
         if not at and (given.row is None or given.col is None):
             return given

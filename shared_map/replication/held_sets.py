@@ -142,9 +142,9 @@ class HeldSets:
     # --- comparing with others ------------------------------------------------------------------------------
 
     def missing(self, theirs: Held) -> list[tuple[str, list[int]]]:
-        """(author, tiles) of which they hold a newer set than we, and which we could hold.
+        """(author, tiles) of the sets that are newer at the other replica, and that this one could hold.
 
-        Sets without capacity are left out: they would be requested again with every digest.
+        Sets for which there is no capacity are left out: they would be requested again with every digest.
         """
         newer = self.ledger.missing(theirs)
         possible = [(author, [tile for tile in tiles if self._could_hold(author, tile)]) for author, tiles in newer]

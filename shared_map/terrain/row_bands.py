@@ -80,8 +80,8 @@ def neighbours(shape: tuple[int, ...], down: int, right: int) -> tuple[Part, Par
 
 
 def padded_rows(elevation_m: Floats, row0: int, row1: int) -> Floats:
-    """Rows row0 - 1 .. row1 with one more column on each side, float32 (row1 - row0 + 2, cols + 2). Beyond the
-    terrain the slope at its border goes on."""
+    """Rows row0 - 1 to row1, with one more column on each side: float32 (row1 - row0 + 2, cols + 2). Heights beyond
+    the terrain continue the slope at its border."""
     rows = elevation_m.shape[0]
     above, below = max(row0 - 1, 0), min(row1 + 1, rows)
     pads = ((above - (row0 - 1), row1 + 1 - below), (1, 1))

@@ -434,7 +434,7 @@ def _price(pace: Floats, stride: int) -> Floats:
 
 
 def _places(price: Floats, count: int, rng: np.random.Generator) -> list[tuple[int, int]]:
-    """Seeded places on cheap ground of the largest connected part, apart from each other."""
+    """Random places, from the seed, on low-cost ground of the largest connected part, apart from each other."""
     rows, cols = price.shape
     passable = price[np.isfinite(price)]
     if passable.size == 0:

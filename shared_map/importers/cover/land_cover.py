@@ -337,11 +337,11 @@ def sampled_codes(dataset: Any, what: str) -> NDArray[Any]:
 
 
 def recognise(dataset: Any, sample: NDArray[Any], what: str) -> tuple[CoverTable, str] | None:
-    """The built-in table of a file of codes, and how it is known; None if none is that of nearly all its cells.
+    """The built-in table of a file of codes, and how it was recognised. None if no table fits nearly all cells.
 
-    sample  codes of some of its cells, (cells,), no-data left out
+    sample  codes of some of the file's cells, (cells,), without no-data
 
-    Raises TerrainError that asks, if several are.
+    Raises TerrainError if several tables fit. The message asks the user to choose one.
     """
     text, there = text_of(dataset), set(np.unique(sample).tolist())
     every = {key: {*table.grounds, *table.nothing} for key, table in TABLES.items()}
