@@ -454,12 +454,9 @@ class Vehicle(Reported):
     def _on_double(self, other: Obstacle) -> None:
         if other.lease_s == 0:
             return
-        who = (
-            "which started later, so vehicles avoid its place and not ours"
-            if (other.incarnation > self.incarnation)
-            else "which started earlier, so vehicles avoid our place and not its"
-        )
-        self._session.problem("doubles_heard", f"another process reports vehicle {self.id}, {who}")
+        started = "later" if other.incarnation > self.incarnation else "earlier"
+        what = f"another process, which started {started}, reports vehicle {self.id}: vehicles avoid both places"
+        self._session.problem("doubles_heard", what)
 
     def tick(self, now_ns: int) -> None:
         super().tick(now_ns)
