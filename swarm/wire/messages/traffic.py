@@ -341,7 +341,7 @@ class KnownRequest(Message, frozen=True, kw_only=True, tag=schema_of("known-requ
     """A new generation of an agent or an external vehicle asks all agents what they know of it. Agents with shards
     of another size do not answer an agent.
 
-    disk   its file; 0 of an external vehicle, and not noted
+    disk   its file; 0 of an external vehicle
     layer  0 ground, 1 air: only agents of this layer answer
     """
 
