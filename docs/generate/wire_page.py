@@ -42,7 +42,8 @@ def document() -> str:
     return filled(
         "wire", first=first, topics=TOPICS, messages=messages(), enums=(MarkKind, VehicleState, RouteStatus),
         version=WIRE_VERSION, alive_key=ALIVE_KEY, operator=OPERATOR, members=MEMBERS.split(), bus=bus, codec=codec,
-        grid=grid, link=_link, granted=_granted, conditions=_conditions, schemas=_schemas, struct=_struct, parts=parts, told=_told(),
+        grid=grid, link=_link, granted=_granted, conditions=_conditions, schemas=_schemas, struct=_struct,
+        parts=parts, told=_told(),
     )  # fmt: skip
 
 

@@ -308,7 +308,7 @@ KNOWN = Topic(
     request=traffic.KnownRequest, published=False, priority=Priority.INTERACTIVE, ask_bytes=_SHORT,
     answer_bytes=_LONG,
 )  # fmt: skip
-"""What an agent has on file about another host, for the host's next generation.
+"""Record of an agent about another host, for the next generation of that host.
 
 Rate: asked at a start
 """

@@ -72,8 +72,8 @@ class Alarm(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Stats(Message, frozen=True, kw_only=True, tag=schema_of("stats")):
-    """Counters of a process. A histogram maps a bucket to a count: bucket n has values near 1.04^n, bucket -20000 those
-    of 0 and below.
+    """Counters of a process. A histogram maps a bucket to a count: bucket n has values near 1.04^n, bucket -20000
+    those of 0 and below.
 
     counts_by      name -> id of a target or vehicle -> its count
     histograms_by  the same of histograms

@@ -225,7 +225,7 @@ class Table(Message, frozen=True, kw_only=True, tag=schema_of("table", 9)):
         return self.epoch, self.seq
 
     def changes(self, base: Table) -> Table:
-        """Returns the same table for members that have an earlier one on file."""
+        """Returns this table as its differences from `base`, for members that have that one on file."""
         if not base.hosts.keys() <= self.hosts.keys():
             return self
         hosts = {host: said for host, said in self.hosts.items() if base.hosts.get(host) != said}
