@@ -168,7 +168,7 @@ class ClassConfig(Section, frozen=True, kw_only=True):
     cost                 differences from `[cost]`: preset, slope rule, speeds, limits, radius. Zones, layers and
                          `directional` are those of `[cost]`
     max_speed_m_per_s    top speed on any ground, with any mark or learned factor
-    sense_range_m        radius of its sensor; default: `vehicles.sense_range_m`
+    sense_range_m        its sensor's radius; default: `vehicles.sense_range_m`
     accel_m_per_s2       greatest acceleration, and deceleration before turns and stops
     turn_rate_deg_per_s  greatest turn rate. With this or `accel_m_per_s2`, `vehicles.dynamics` has no effect
     air                  settings of a flying class: `cost` and `max_speed_m_per_s` then have no effect, and ground
