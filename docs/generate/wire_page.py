@@ -21,7 +21,7 @@ from swarm.config.explain import meanings
 from swarm.wire import codec, topics
 from swarm.wire.access import MEMBERS, MEMBERS_OWN, OPERATOR, Grant
 from swarm.wire.fields import Characters, Column, taken_apart
-from swarm.wire.messages import WIRE_VERSION, Message
+from swarm.wire.messages import WIRE_VERSION, Message, Nothing
 from swarm.wire.messages.map_data import SEQ_STEP, MarkKind
 from swarm.wire.messages.vehicles import VehicleState
 from swarm.wire.route_columns import RouteStatus
@@ -30,6 +30,8 @@ from swarm.wire.versions import read_schemas, written_schema
 
 PATH = Path(__file__).parents[1] / "reference" / "wire.md"
 JSON_PATH = PATH.with_name("wire-json.md")
+USUAL_BYTES = 256 << 10
+"""Limit of a payload that the page states once."""
 REQUIRED = "required"
 """In place of the default of a field without one."""
 
@@ -40,7 +42,8 @@ def document() -> str:
     return filled(
         "wire", first=first, topics=TOPICS, messages=messages(), enums=(MarkKind, VehicleState, RouteStatus),
         version=WIRE_VERSION, alive_key=ALIVE_KEY, operator=OPERATOR, members=MEMBERS.split(), bus=bus, codec=codec,
-        grid=grid, link=_link, granted=_granted, schemas=_schemas, struct=_struct, parts=parts, told=_told(),
+        grid=grid, link=_link, granted=_granted, conditions=_conditions, schemas=_schemas, struct=_struct,
+        parts=parts, told=_told(),
     )  # fmt: skip
 
 
@@ -63,6 +66,16 @@ def _granted(grants: tuple[Grant, ...]) -> str:
     named = (":".join(filter(None, (of.role, ",".join(of.own)))) for of in grants if of.role != OPERATOR)
     words = " ".join(named) or OPERATOR
     return words.replace(MEMBERS_OWN, "members:role,id").replace(MEMBERS, "members").replace(" ", ", ")
+
+
+def _conditions(topic: Topic, act: str) -> str:
+    """In brackets: whether the act needs no code, and the limit of its payloads if it is not the usual one."""
+    free = ["free"] if ("answer" if act == "serve" else act) in topic.free else []
+    asked = USUAL_BYTES if topic.request is Nothing else topic.ask_bytes
+    most = {"put": topic.put_bytes, "ask": asked, "serve": topic.answer_bytes}.get(act, USUAL_BYTES)
+    size = f"{most >> 10}K" if most < 1 << 20 else f"{most >> 20}M"
+    words = ", ".join(free + [size] * (most != USUAL_BYTES))
+    return f" ({words})" if words else ""
 
 
 def _link(message: type[Message]) -> str:
@@ -90,7 +103,7 @@ def _struct(struct: type[msgspec.Struct]) -> str:
     fields: dict[tuple[str, ...], list[str]] = {}
     for name, *rest in rows(struct):
         fields.setdefault((*rest, told.get(name, ""), name if is_array else ""), []).append(name)
-    return filled("struct", about=prose(struct), fields=fields, is_array=is_array, required=REQUIRED)
+    return filled("struct", about=prose(struct), fields=fields, required=REQUIRED)
 
 
 def rows(struct: type[msgspec.Struct]) -> list[list[str]]:

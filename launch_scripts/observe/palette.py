@@ -73,7 +73,7 @@ def photo_of(seen: Level) -> NDArray[np.uint8]:
 
 
 def image_bytes(pixels: NDArray[np.uint8], format: str) -> bytes:
-    """Pixels as "WEBP" or "PNG"."""
+    """Returns the pixels as the bytes of a "WEBP" or "PNG" image."""
     from PIL import Image  # takes time to import
 
     file = io.BytesIO()

@@ -397,8 +397,8 @@ class Recorder:
         startup_s: float | None = None,
         failures: Sequence[str] = (),
     ) -> dict[str, Any]:
-        """The numbers of the run, None where not measured, and the verdict in a sentence. The caller passes what
-        only it knows, such as failures of processes."""
+        """Returns the numbers of the run (None for those not measured) and the verdict in a sentence. The caller
+        passes what only it knows, such as failures of processes."""
         observed = self.observed
         if seconds is None and observed.first_ns is not None and observed.last_ns is not None:
             seconds = (observed.last_ns - observed.first_ns) / NS_PER_S
@@ -459,7 +459,8 @@ class Recorder:
 
 
 def _track(tracks: Thinned[Sampling], now_ns: int, keys: Iterable[TrackKey], places_m: NDArray[np.float32]) -> None:
-    """Adds a sampling. The same keys come each time: they take most of the memory unless they are kept once."""
+    """Adds the places of all `keys` at one instant. Repeated keys are stored once: they would take most of
+    the memory."""
     of, before = tuple(keys), tracks.last.keys if tracks.last else ()
     if of:
         tracks.add(Sampling(now_ns, before if before == of else of, places_m))

@@ -256,7 +256,7 @@ def run_facts(folder: Path) -> dict[str, Any]:
 
 
 def point_last(folder: Path) -> str | None:
-    """Makes `LAST` beside a run's folder a link to that run, at one instant. Returns a sentence if that is
+    """Makes `LAST` beside a run's folder a link to that run, in one step. Returns a sentence if that is
     impossible."""
     last, partial = folder.parent / LAST, folder.parent / f".{LAST}.{os.getpid()}"
     try:

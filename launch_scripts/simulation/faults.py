@@ -70,7 +70,7 @@ class ClockStep(msgspec.Struct, frozen=True):
 
 
 class Twin(msgspec.Struct, frozen=True):
-    """Starts a second generation of an agent on another machine, while the first may live."""
+    """Starts a second generation of an agent on another machine, while the first may still run."""
 
     at_s: float
     node: str

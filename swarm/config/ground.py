@@ -170,9 +170,9 @@ class CostLayerConfig(Section, frozen=True, kw_only=True):
 
 
 class CostConfig(Section, frozen=True, kw_only=True):
-    """Rules that turn terrain into pace.
+    """Rules that turn terrain into pace (s/m).
 
-    preset                  a kind of vehicle, whose settings are the defaults of all others
+    preset                  a kind of vehicle, whose values are the defaults of all other keys
     flat_speed_m_per_s      speed on level open ground
     road_speed_m_per_s      speed on roads
     slope_rule              effect of slope on pace (docs/gis/costs.md)

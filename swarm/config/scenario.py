@@ -169,7 +169,7 @@ class PlannerConfig(Section, frozen=True, kw_only=True):
     edge              octile: a diagonal step is sqrt(2) long; paper: each step costs as much as its cell
     neighbours        cells which one step reaches: 4, or 8 with the diagonal ones
     corner_cutting    true: a diagonal step may pass the corner of a lethal cell
-    length_weight     lambda of the paper's length-aware key, seconds per metre
+    length_weight     price of a metre in seconds, the paper's lambda
     k_min             smallest block exponent of the paper: the narrowest window is 2**(k_min+1) + 1 cells wide with
                       variable range, 2**(k_min+3) + 1 with other strategies
     cpu_budget        auto: share of one core which this planner may use

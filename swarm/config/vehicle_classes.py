@@ -133,7 +133,7 @@ class WindConfig(Section, frozen=True, kw_only=True):
     """Wind for flying vehicles: equal everywhere and at every height. It has no effect on the ground.
 
     speed_m_per_s  must be below the speed of each flying class, which can then fly in every direction
-    from_deg       its origin, clockwise from the map's north: 270 is a west wind
+    from_deg       where it comes from, clockwise from the map's north: 270 is a west wind
     """
 
     speed_m_per_s: Annotated[float, Meta(ge=0, le=340)] = 0.0
@@ -168,7 +168,7 @@ class ClassConfig(Section, frozen=True, kw_only=True):
     cost                 differences from `[cost]`: preset, slope rule, speeds, limits, radius. Zones, layers and
                          `directional` are those of `[cost]`
     max_speed_m_per_s    top speed on any ground, with any mark or learned factor
-    sense_range_m        default: `vehicles.sense_range_m`
+    sense_range_m        its sensor's radius; default: `vehicles.sense_range_m`
     accel_m_per_s2       greatest acceleration, and deceleration before turns and stops
     turn_rate_deg_per_s  greatest turn rate. With this or `accel_m_per_s2`, `vehicles.dynamics` has no effect
     air                  settings of a flying class: `cost` and `max_speed_m_per_s` then have no effect, and ground

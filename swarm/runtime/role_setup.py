@@ -22,12 +22,12 @@ class RoleSetup:
     incarnation    nanoseconds at its start: a later start of the same (role, id) has a larger one
     started_ns     start of the run
     run_dir        where this machine keeps the run: prepared terrain, the keeper's store, logs; None if nowhere
-    added          of an agent that the scenario does not name: what it hosts
+    added          vehicles of an agent that the scenario does not name
     restarts       how often it was started before in this run
-    before         what its earlier generations have counted; None if that is not known
+    before         counts of its earlier generations; None if they are not known
     anew           True if this is its first start in the run
-    takes_over     whether the generation before it may still run on this machine, and ends soon
-    record_inputs  whether all that it hears is written into `run_dir`, so that it can be replayed
+    takes_over     True if the generation before it may still run on this machine, and ends soon
+    record_inputs  True if all messages to it are written into `run_dir`, so that it can be replayed
     health         receives the health of its loop; None: no reports
     """
 

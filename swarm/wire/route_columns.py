@@ -71,9 +71,9 @@ class Route(Bounded, frozen=True, kw_only=True):
     lower_bound_s  proven: no route from cell to neighbouring cell is quicker, on the map as the tree knows it
     length_m       of the way given
     remaining_s    cost-to-go after it, 0 at the target
-    legs           for each straight segment of a pulled route, its number of steps, from the middle of one cell to
-                   that of another. The steps are along the cells that it crosses, and may themselves be driven.
-                   Costs and bound are of the route that was pulled. Empty: it was not
+    legs           for each straight segment of an any-angle route, from middle to middle of cells, its number of
+                   steps. These are along the cells that it crosses, and may be driven instead. Costs and bound
+                   are those of the grid route. Empty: a grid route
     """
 
     status: RouteStatus
@@ -251,7 +251,7 @@ _Numbers = Annotated[bytes, Column("<f8", per="statuses", least=0, most=math.inf
 class Routes(Bounded, frozen=True, kw_only=True, dict=True):
     """Many routes as columns, with the fields of `Route`. The numbers of those whose status is OK are finite.
 
-    statuses    RouteStatus, as its index
+    statuses    RouteStatus: its place in the list below, from 0
     starts      cells
     directions  of all routes, one after the other: eight steps in three bytes, the first in the lowest three bits
     legs        of all routes, one after the other; empty if none is pulled

@@ -189,7 +189,7 @@ MARKS = Topic(
     ),
     request=map_data.MarksRequest, bulk=map_data.MarkSets, free=("ask",), buffer=8192, answer_bytes=2 * _LONG,
 )  # fmt: skip
-"""An author's whole set for a tile, served by the author and the keeper.
+"""An author's whole set for a tile.
 
 Rate: on change, at most 10 Hz a tile
 """
@@ -197,7 +197,7 @@ DIGEST = Topic(
     "digest", "digest/{author}", map_data.Digest,
     access(put="agent:author rover:author keeper:author", hear=_REPLICAS), priority=Priority.BACKGROUND,
 )  # fmt: skip
-"""Sets of a replica.
+"""Sets that a replica holds.
 
 Rate: 1 Hz, and on change
 """
@@ -238,7 +238,7 @@ SENT = Topic(
     "sent", "place/{places}/sent/{author}", vehicles.Chasers, access(put="agent:author", hear="places:places"),
     put_bytes=_LONG,
 )  # fmt: skip
-"""The same of vehicles which are sent to places.
+"""The same for vehicles which are sent to places.
 
 Rate: as chasers
 """
@@ -274,7 +274,7 @@ GRANTED = Topic(
     "granted", "granted/{shard}/{host}/{agent}", traffic.Granted,
     access(put="agent:agent", hear="agent:host rover:host"), priority=Priority.INTERACTIVE, put_bytes=_LONG,
 )  # fmt: skip
-"""Cells of a shard granted to one host, on file with its members.
+"""Cells of a shard granted to one host.
 
 Rate: on change, else 5 Hz
 """
@@ -282,8 +282,7 @@ WORD = Topic(
     "word", "word/{shard}/{host}/{agent}", traffic.Word, access(put="agent:agent", hear="agent:host rover:host"),
     priority=Priority.INTERACTIVE, put_bytes=_SHORT,
 )  # fmt: skip
-"""Digest of what a member has on file for a host, which uses a grant once a majority confirms it; only with
-certificates.
+"""Digest of what a member has on file for a host; only with certificates.
 
 Rate: on change, else 5 Hz
 """
@@ -292,7 +291,7 @@ LEFT = Topic(
     access(put="agent:agent rover:agent", hear="agent:host rover:host"), newest=False,
     priority=Priority.INTERACTIVE, put_bytes=_LONG,
 )  # fmt: skip
-"""Cells which vehicles of a host have left, to a host whose vehicles wait for them.
+"""Cells which a host's vehicles have left, to a host that waits for them.
 
 Rate: on change, and at 5 Hz until the leader has counted it
 """
@@ -309,7 +308,7 @@ KNOWN = Topic(
     request=traffic.KnownRequest, published=False, priority=Priority.INTERACTIVE, ask_bytes=_SHORT,
     answer_bytes=_LONG,
 )  # fmt: skip
-"""An agent's file on another host, for its next generation.
+"""Record of an agent about another host, for the next generation of that host.
 
 Rate: asked at a start
 """
@@ -469,7 +468,7 @@ OBEYED = Topic(
     "obeyed", "obeyed/{role}/{id}", orders.Obeyed, access(serve="agent:role,id planner:role,id targets:role,id"),
     request=orders.Obey, published=False, priority=Priority.INTERACTIVE, ask_bytes=_LONG, answer_bytes=_SHORT,
 )  # fmt: skip
-"""Obedience of a process to an order.
+"""Reply of a process as soon as it obeys an order.
 
 Rate: asked after each order
 """

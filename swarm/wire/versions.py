@@ -113,7 +113,7 @@ def as_read(fields: Fields, message_type: type[Message]) -> Fields:
 
 
 def as_written(message: Message) -> Fields | None:
-    """The fields and `schema` of the version before, where this build writes that one; None where it does not."""
+    """Returns the fields and `schema` of a message's older version if this build writes that one, else None."""
     written = written_schema(type(message))
     if written == schema_of_type(type(message)):
         return None

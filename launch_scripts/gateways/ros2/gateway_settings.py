@@ -154,7 +154,7 @@ class Robots(Section, frozen=True, kw_only=True):
 
     id             id of one robot; default, with {robot} in the topic: each robot with such a topic
     topic          topic of its position
-    type           type of this topic: odometry, pose, pose_with_covariance
+    type           type of this topic
     frame          frame of its position, beside the map frame
     offset_m       origin of that frame in the map frame: x, y
     turn_rad       rotation of that frame against the map frame, counter-clockwise

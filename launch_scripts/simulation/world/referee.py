@@ -64,8 +64,8 @@ class Broken:
     evidence: tuple[Stay, ...] = field(compare=False)
 
     def sentence(self, began_ns: int) -> str:
-        """Returns the finding, and the reports which prove it: when each was on the cell, in seconds since the run
-        began, and the reports' numbers and key. A recording of the run has them."""
+        """Returns the finding and its proof: when each vehicle or obstacle was on the cell, in seconds since the
+        run began, and the key and numbers of its reports, by which they are found in a recording of the run."""
 
         def on_cell(each: Stay) -> str:
             begin_s, end_s = ((at_ns - began_ns) / NS_PER_S for at_ns in (each.begin_ns, each.end_ns))

@@ -127,13 +127,13 @@ class MarkSet(Message, frozen=True, kw_only=True, gc=False, tag=schema_of("marks
     An author counts `seq` in steps of 65536. The numbers between are for keepers, which drop superseded marks of
     dead authors. Such a set without marks is a tombstone: readers drop the author's marks in that tile.
 
-    tile       in a grid of N tiles, 0 to N - 1 are tiles for all vehicles, row by row from the north-west. N holds
-               the author's learned factors. n (N + 1) + t is tile t for vehicle class n only
+    tile       in a grid of N tiles, 0 to N - 1 are tiles for all vehicles. N holds the author's learned factors.
+               n (N + 1) + t is tile t for vehicle class n only
     epoch      1; the next whenever a keeper took the living author for dead
     cells      indices inside the tile, row-major over 32 x 32, strictly increasing
     kinds      MarkKind
     paces      s/m for PACE, ignored otherwise
-    stamps_ns  hybrid logical time of each mark
+    stamps_ns  when each mark was made, by the author's clock, but later than the mark which it replaces
     untils_ns  end of each mark, or FOREVER (2^63 - 1); empty if none ends
     """
 
@@ -221,7 +221,7 @@ class Digest(Message, frozen=True, kw_only=True, tag=schema_of("digest")):
     committed. Only a keeper (by `author`) names sets of others.
 
     role   not used
-    held   author -> rows of tile (uint32), epoch and seq (uint64 each)
+    held   author -> its sets
     whole  false: only tiles that changed lately, or a part of a whole digest
     seq    number of the digest, so that a late one replaces no newer one; 0: not numbered
     after  of a part: author and tile after which it begins; None: with the first

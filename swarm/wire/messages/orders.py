@@ -110,7 +110,7 @@ class Zones(Message, frozen=True, kw_only=True, tag=schema_of("zones")):
     """The zones in force, as on the disk of this keeper.
 
     changed  name of the added or removed zone
-    sets     its mark sets, as rows of a digest: a process that holds these obeys
+    sets     its mark sets: a process that holds these obeys
     """
 
     keeper: fields.Id
@@ -290,7 +290,7 @@ GoalStateName = Literal["queued", "underway", "delayed", "blocked", "standby", "
 
 
 class GoalState(fields.Bounded, frozen=True, kw_only=True):
-    """Progress of a vehicle along the places of one order. The states are those of tasks in Open-RMF.
+    """Progress of a vehicle along the places of one order.
 
     name      of the vehicle
     stamp_ns  of the order
@@ -327,7 +327,7 @@ class Obey(Message, frozen=True, kw_only=True, tag=schema_of("obey")):
     """Asks a process to reply as soon as it obeys. A zone is named by `author` and `sets`, any other order by
     `subject`, `name` and `stamp_ns`.
 
-    sets   rows of a digest
+    sets   those of `Zones`
     goals  the order is about the goals of the vehicle `name`
     """
 

@@ -214,7 +214,7 @@ POSE_LEASE_S = 2.0
 
 
 class TargetPose(Message, frozen=True, kw_only=True, tag=schema_of("pose")):
-    """Position of a target, by one of its trackers (`swarm.runtime.tracker_ownership`).
+    """Position of a target, by one of its trackers (docs/vehicle/tracker.md).
 
     tracker      name of the tracker; a later incarnation of the same name takes over at once. Without a name each
                  incarnation is a tracker of its own
@@ -222,7 +222,6 @@ class TargetPose(Message, frozen=True, kw_only=True, tag=schema_of("pose")):
     seq          grows within an incarnation
     lease_s      the tracker counts as lost when no pose of it has arrived for this time; 0 hands the target over
     cell         -1: that of `x_m`, `y_m`
-    captures     number of captures
     jumps        how often it was put somewhere else, as after a capture
     """
 

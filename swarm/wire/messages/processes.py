@@ -20,9 +20,9 @@ class RunInfo(Message, frozen=True, kw_only=True, tag=schema_of("run")):
     west_m, north_m  the north-west corner of the grid
     crs              its coordinate system
     now_ns           clock at the last tick; 0 before the first
-    vehicles         number of vehicles of the scenario
+    vehicles         of the scenario
     crew             processes which the scenario needs, as `role-id`
-    restarts         number in this run
+    restarts         in this run
     classes          of vehicles beside "ground", in the order of their numbers
     shard_cells      side of a shard: two layouts in one run would grant a cell twice
     """
@@ -57,7 +57,7 @@ class RunInfo(Message, frozen=True, kw_only=True, tag=schema_of("run")):
 class Alarm(msgspec.Struct, frozen=True, kw_only=True):
     """Notice to people: a collision, an author beyond its quota.
 
-    kind     a word of `launch_scripts.observe.alarms.KINDS`; any other is shown as it is
+    kind     a word of `launch_scripts/observe/alarms.toml`; any other is shown as it is
     about    process, target, author or vehicle
     over_ns  when it ended; None while it lasts
     """
@@ -72,7 +72,8 @@ class Alarm(msgspec.Struct, frozen=True, kw_only=True):
 
 
 class Stats(Message, frozen=True, kw_only=True, tag=schema_of("stats")):
-    """Counters of a process. Histograms are as in `swarm.runtime.stats`.
+    """Counters of a process. A histogram maps a bucket to a count: bucket n has values near 1.04^n, bucket -20000
+    those of 0 and below.
 
     counts_by      name -> id of a target or vehicle -> its count
     histograms_by  the same of histograms

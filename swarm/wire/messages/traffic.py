@@ -225,7 +225,7 @@ class Table(Message, frozen=True, kw_only=True, tag=schema_of("table", 9)):
         return self.epoch, self.seq
 
     def changes(self, base: Table) -> Table:
-        """Returns the same table for members that have an earlier one on file."""
+        """Returns this table as its differences from `base`, for members that have that one on file."""
         if not base.hosts.keys() <= self.hosts.keys():
             return self
         hosts = {host: said for host, said in self.hosts.items() if base.hosts.get(host) != said}
@@ -341,7 +341,7 @@ class KnownRequest(Message, frozen=True, kw_only=True, tag=schema_of("known-requ
     """A new generation of an agent or an external vehicle asks all agents what they know of it. Agents with shards
     of another size do not answer an agent.
 
-    disk   its file; 0 of an external vehicle, and not noted
+    disk   its file; 0 of an external vehicle
     layer  0 ground, 1 air: only agents of this layer answer
     """
 

@@ -134,7 +134,7 @@ class SharedCosts(Message, frozen=True, kw_only=True, tag=schema_of("shared-cost
 class Followed(Message, frozen=True, kw_only=True, tag=schema_of("followed")):
     """The route that a vehicle has just begun to follow.
 
-    legs  as in `Route`; the first begins where the vehicle is, on a segment perhaps
+    legs  as in `Route`; the first begins where the vehicle is
     """
 
     vehicle: fields.VehicleId
@@ -166,7 +166,7 @@ class Obstacle(Message, frozen=True, kw_only=True, tag=schema_of("body")):
     group          whose it is, for those who watch
     incarnation    when its sender started, in ns: of two senders under one id the later counts
     seq            grows with each message of an incarnation
-    stamp_ns       when it was there, by the sender's clock; nothing is decided by it
+    stamp_ns       when it was there; not used
     x_m, y_m       in the terrain's frame, as of a `TargetPose`
     heading_rad    clockwise from north; None if it may go any way
     speed_m_per_s  by the wall clock
