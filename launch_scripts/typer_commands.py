@@ -279,7 +279,7 @@ def run_command(command: Callable[[], Any], name: str = "swarm") -> int:
             raise  # a fault of ours
         return _refused(f"this needs {missing(package)}", ConfigError.exit_code)
     except MemoryError:
-        return _refused("this takes more memory than a process may use here (ulimit -v)", SwarmError.exit_code)
+        return _refused("there is not enough memory for this (`ulimit -v` may be the limit)", SwarmError.exit_code)
     except BrokenPipeError:
         discard_output(1)  # the interpreter would complain at its end about what still waits to be printed
         return 0

@@ -71,8 +71,7 @@ def _granted(grants: tuple[Grant, ...]) -> str:
 def _conditions(topic: Topic, act: str) -> str:
     """In brackets: whether the act needs no code, and the limit of its payloads if it is not the usual one."""
     free = ["free"] if ("answer" if act == "serve" else act) in topic.free else []
-    asked = USUAL_BYTES if topic.request is Nothing else topic.ask_bytes
-    most = {"put": topic.put_bytes, "ask": asked, "serve": topic.answer_bytes}.get(act, USUAL_BYTES)
+    most = {"put": topic.put_bytes, "ask": topic.ask_bytes, "serve": topic.answer_bytes}.get(act, USUAL_BYTES)
     size = f"{most >> 10}K" if most < 1 << 20 else f"{most >> 20}M"
     words = ", ".join(free + [size] * (most != USUAL_BYTES))
     return f" ({words})" if words else ""

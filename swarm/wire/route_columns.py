@@ -251,7 +251,7 @@ _Numbers = Annotated[bytes, Column("<f8", per="statuses", least=0, most=math.inf
 class Routes(Bounded, frozen=True, kw_only=True, dict=True):
     """Many routes as columns, with the fields of `Route`. The numbers of those whose status is OK are finite.
 
-    statuses    RouteStatus: its place in the list below, from 0
+    statuses    its place in RouteStatus, from 0
     starts      cells
     directions  of all routes, one after the other: eight steps in three bytes, the first in the lowest three bits
     legs        of all routes, one after the other; empty if none is pulled

@@ -106,6 +106,32 @@ def test_digests_come_from_keepers_and_from_those_who_speak_of_what_is_held() ->
     assert here.replica.missing(beside.replica.own_digest()) == []
 
 
+class Deaf(LossyLinks):
+    """The keeper hears nothing from one author, and for a while no replica does."""
+
+    quiet = True
+
+    def delays_ns(self, source: str, destination: str, what: str, now_ns: int) -> Sequence[int]:
+        if source == "far.1" and (self.quiet or destination == "k.1"):
+            return ()
+        return super().delays_ns(source, destination, what, now_ns)
+
+
+def test_what_neither_a_known_author_nor_a_keeper_tells_is_found_when_all_are_listened_to() -> None:
+    links = Deaf(1)
+    swarm = SwarmModel(links, TERRAIN)
+    store = KeeperStore(":memory:")
+    keeper = swarm.keeper("k", store)
+    keeper._sync._fetch = lambda *_: None  # type: ignore[method-assign]
+    here, far = swarm.near("here.1", frozenset({0})), swarm.near("far.1", frozenset({0}))
+    swarm.run(8)
+    write(swarm, far, 5)
+    swarm.run(1)
+    links.quiet = False
+    swarm.run(ROUND_S)
+    assert lacks(here, far, ["far.1"]) == 0
+
+
 def test_a_set_of_one_who_is_not_listened_to_is_not_taken_for_one_of_the_dead_and_of_the_dead_it_is() -> None:
     chance = random.Random(2)
     swarm = SwarmModel(terrain=TERRAIN)

@@ -2,12 +2,12 @@
 
 import numpy as np
 import pytest
-from support.planner_strategies import inside, random_pace, random_window
+from support.planner_strategies import random_pace
 
 from planner_service.target_tree import TargetTree
 from planner_service.tree import cost_grid
 from swarm.config.scenario import PlannerConfig, Strategy
-from swarm.grid import GridSpec
+from swarm.grid import GridSpec, Window
 
 
 def nearest(grid: GridSpec, pace: np.ndarray, led: np.ndarray, cell: int, half: int) -> int | None:
@@ -55,20 +55,19 @@ def test_a_target_over_water_has_the_nearest_shore_from_which_a_tree_led(
                 expected = nearest(grid, pace, led.reshape(pace.shape), cell, near_cells)
                 assert answer.nearest == expected
                 found["none" if expected is None else "a shore" if led[expected] else "no tree leads there"] += 1
-            # It steps over water, jumps anywhere, and now and then the map changes.
+            # It steps over water, jumps anywhere, and now and then the map changes where it stands.
             row, col = grid.row_col(cell)
             row, col = row + int(rng.integers(-2, 3)), col + int(rng.integers(-2, 3))
             if rng.random() < 0.4 or not grid.inside(row, col):
                 row, col = int(rng.integers(grid.rows)), int(rng.integers(grid.cols))
             cell = grid.cell(row, col)
             if rng.random() < 0.15:
-                window = random_window(rng, pace, 3, 3)
-                inside(pace, window)[:] = random_pace(rng, *inside(pace, window).shape, 3.0, 0.5)
+                window = Window(row, col, min(row + 3, grid.rows), min(col + 3, grid.cols))
+                marked = np.s_[window.row0 : window.row1, window.col0 : window.col1]
+                pace[marked] = random_pace(rng, *pace[marked].shape, 3.0, 0.5)
                 dirty = [window]
                 if not tree._is_whole:
-                    inside(led.reshape(pace.shape), window)[:] = (
-                        False  # of a growth that has stopped nothing is left there
-                    )
+                    led.reshape(pace.shape)[marked] = False  # of a growth that has stopped nothing is left there
     assert found["a shore"] > 20, found
     assert (found["no tree leads there"] and found["none"]) or near_cells == 256, found
     assert (found["stopped"] > 20) == (strategy == "full"), found

@@ -54,12 +54,16 @@ OPERATIONS = ("put", "delete", "serve", "ask", "hear", "raise", "watch", "look")
 EVERYBODY = (*ROLES, "standby", "outsider", "revoked")
 
 FORBIDDEN = [
+    ("agent", "put", "marks/0/0/red.a1.1"),
     ("agent", "put", "marks/0/0/blue.a01.1"),
+    ("agent", "put", "reservations/a1"),
     ("agent", "put", "target/t0/pose"),
     ("agent", "put", "target/t0/chasers/red.a1.1"),
     ("agent", "hear", "target/t0/chasers/blue.a0.1"),
     ("agent", "put", "vehicle/a1/v0/route"),
     ("agent", "put", "stats/router/0"),
+    ("agent", "serve", "run/agent/zz"),
+    ("agent", "serve", "run/keeper/0"),
     ("agent", "serve", "target/t0/route"),
     ("agent", "ask", "target/t0/route/agent.a1"),
     ("agent", "ask", "target/t0/cost/rover.a0"),
@@ -67,32 +71,44 @@ FORBIDDEN = [
     ("rover", "ask", "target/t0/cost/agent.r1"),
     ("agent", "hear", "vehicle/a1/*/route"),
     ("agent", "hear", "**"),
+    ("agent", "raise", "alive/agent/zz/1"),
+    ("agent", "raise", "alive/router/0/1"),
+    ("planner", "serve", "target/t1/route"),
     ("planner", "serve", "target/*/route"),
     ("planner", "serve", "**"),
     ("planner", "put", "target/t0/pose"),
     ("planner", "hear", "world/target/t0/pose"),
     ("planner", "hear", "target/t1/chasers/blue.a0.1"),
+    ("planner", "raise", "alive/planner/t1/1"),
     ("standby", "serve", "target/t1/route"),
     ("standby", "serve", "target/t0.r1/route"),
     ("standby", "serve", "run/planner/t0"),
     ("standby", "put", "lead/planner/t0"),
     ("standby", "put", "stats/planner/t0"),
     ("standby", "raise", "alive/planner/t0/1"),
+    ("places", "serve", "place/blue/route/agent.a0"),
     ("places", "serve", "target/t0/route"),
     ("places", "put", "marks/0/0/blue.a0.1"),
     ("agent", "serve", "place/red/route/agent.a0"),
     ("agent", "ask", "place/red/route/agent.a1"),
     ("monitor", "put", "marks/0/0/blue.a0.1"),
     ("operator", "put", "note/operator/anna"),
+    ("operator", "raise", "alive/operator/anna/1"),
+    ("tracker", "put", "target/t1/pose"),
+    ("rover", "put", "body/r2"),
     ("rover", "put", "target/t0/pose"),
+    ("rover", "put", "marks/0/0/all.r2.1"),
     ("rover", "hear", "vehicle/r2/r2/route"),
+    ("rover", "raise", "alive/agent/r1/1"),
     ("agent", "put", "body/r1"),
     ("outsider", "hear", "**"),
     ("outsider", "ask", "**"),
+    ("outsider", "put", "marks/0/0/blue.a7.1"),
+    ("outsider", "raise", "alive/agent/a7/1"),
     ("revoked", "hear", "fleet/0/blue.a0.1"),
+    ("revoked", "raise", "alive/agent/a8/1"),
 ]
-"""Written by hand, in case the table itself were wrong: what is no key of `cases`, nor in the list of those who
-speak for others (tests/unit/swarm/test_access.py)."""
+"""Written by hand, in case the table itself were wrong."""
 
 
 @dataclass(frozen=True)

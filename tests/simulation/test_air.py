@@ -12,6 +12,7 @@ from launch_scripts.simulation.laws import LawBook
 from launch_scripts.simulation.simulate import Node
 from shared_map.vehicle_class_grounds import class_grounds, clearance_floor
 from swarm.config.scenario_files import parse_scenario
+from swarm.wire.messages.orders import ZoneOrder
 
 SECONDS = 12.0
 _TEXT = """
@@ -122,3 +123,21 @@ def test_the_wind_says_how_fast_a_drone_is_over_the_ground_in_each_direction(rou
     assert speed_mps(routes, EAST, WEST) == pytest.approx(6.0, rel=0.01)
     across = math.sqrt(0.5) * 6.0
     assert speed_mps(routes, WEST, SOUTH_EAST) == pytest.approx(math.sqrt(12**2 - across**2) + across, rel=0.01)
+
+
+def test_an_operators_zone_for_a_class_that_flies_is_a_no_fly_zone_and_rovers_go_on_below() -> None:
+    scenario, terrain = made(_TEXT)
+    simulation = OrderedSimulation(scenario, terrain=terrain)
+
+    def inside(name: str) -> int:
+        return int(zone.ravel()[list(cells(simulation, name).values())].sum())
+
+    zone = np.zeros((64, 64), bool)
+    zone[20:50, 20:50] = True
+    corners = [(20.0, 20.0), (20.0, 50.0), (50.0, 50.0), (50.0, 20.0)]
+    simulation.run_until(3.0)
+    assert inside("drone") > 0
+    simulation.order(3.0, ZoneOrder(action="add", name="z", polygon=corners, vehicle_class="drone"))
+    simulation.run_until(10.0)
+    assert inside("drone") == 0
+    assert inside("ground") > 0

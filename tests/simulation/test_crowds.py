@@ -5,11 +5,12 @@ import pytest
 from msgspec.structs import replace
 from support.simulated import cells
 
-from launch_scripts.simulation.faults import random_plan
+from launch_scripts.simulation.faults import Crash, FaultPlan, Partition, Twin, random_plan
 from launch_scripts.simulation.laws import LawBook
 from launch_scripts.simulation.sample_worlds import CROWDS, crowd, seeded
 from launch_scripts.simulation.simulate import Simulation
 from swarm.config.scenario import TlsConfig
+from swarm.wire.messages.vehicles import VehicleState
 
 SECONDS = 20.0
 
@@ -52,3 +53,42 @@ def test_vehicles_that_wait_because_two_of_three_members_are_gone_say_why_and_dr
     simulation.nodes["agent-a0"].boot()
     simulation.run_until(14)
     assert any(cells(simulation)[id] != cell for id, cell in before.items())
+
+
+@pytest.mark.seeds(4)
+def test_of_two_generations_of_one_agent_the_older_stops_until_the_younger_is_gone_and_no_one_is_met(seed):
+    """An agent is cut off, and started again on another machine; then the cut heals. Later that machine dies."""
+    plan = FaultPlan(partitions=(Partition(5, 9, ("agent-a1",)),), twins=(Twin(8, "agent-a1"),))
+    simulation = Simulation(seeded(seed), faults=plan)
+    laws = LawBook(simulation)
+    simulation.run_until(22)
+    older, younger = (simulation.nodes[name].service for name in ("agent-a1", "agent-a1.2"))
+    assert laws.collisions == []
+    assert older.agent.vehicles == {}
+    assert len(younger.agent.vehicles) == 4
+    assert any(vehicle.state is not VehicleState.IDLE for vehicle in younger.agent.vehicles.values())
+    simulation.nodes["agent-a1.2"].crash()  # for good: the older one takes over again
+    simulation.run_until(25)
+    before = {id: vehicle.cell for id, vehicle in older.agent.vehicles.items()}
+    simulation.run_until(34)  # some stand in a knot with others for several seconds
+    assert len(before) == 4
+    assert sum(older.agent.vehicles[id].cell != cell for id, cell in before.items()) >= 2
+    assert laws.collisions == []
+
+
+@pytest.mark.parametrize("skew_s", [3600.0, -1_799_999_000.0])
+def test_an_agent_that_starts_again_with_another_clock_is_like_any_other(skew_s):
+    """An hour forward, and in 1970."""
+    simulation = Simulation(seeded(3), faults=FaultPlan(crashes=(Crash(6, "agent-a1"),)))
+    laws = LawBook(simulation)
+    simulation.run_until(6.1)
+    simulation.nodes["agent-a1"].skew_ns = int(skew_s * 1e9)
+    simulation.run_until(8)
+    before = {id: cell for id, cell in cells(simulation).items() if id.startswith("a1")}
+    assert len(before) == 4
+    moved: set[str] = set()  # one may be back where it was, after its target was given to another
+    while simulation.now_s < 14:
+        simulation.run_until(simulation.now_s + 0.5)
+        moved |= {id for id, cell in before.items() if cells(simulation)[id] != cell}
+    assert moved == set(before)
+    assert laws.collisions == []

@@ -59,6 +59,21 @@ def test_vehicles_among_one_way_slopes_have_a_route_or_say_that_they_are_strande
     assert LawBook(simulation).run(SECONDS) == []
 
 
+def test_an_agent_cut_off_enters_nothing_new_and_goes_on_when_it_is_back():
+    plan = FaultPlan(partitions=(Partition(4, 12, ("agent-a1",)),), quiet_s=16)
+    simulation = Simulation(seeded(2), faults=plan)
+    laws = LawBook(simulation)
+    simulation.run_until(4)
+    agent = agents(simulation)["agent-a1"].agent
+    simulation.run_until(4.2)  # a message in transit before the cut may still be granted
+    held = {id: list(agent.holdings.path(id)) for id in agent.vehicles}
+    simulation.run_until(12)
+    assert all(vehicle.cell in held[id] for id, vehicle in agent.vehicles.items())
+    simulation.run_until(20)
+    assert not all(vehicle.cell in held[id] for id, vehicle in agent.vehicles.items())
+    assert laws.collisions == []
+
+
 def test_an_agent_restarted_while_cut_off_waits_until_someone_tells_where_its_vehicles_stood():
     plan = FaultPlan(partitions=(Partition(4, 12, ("agent-a1",)),), crashes=(Crash(9, "agent-a1"),), quiet_s=16)
     simulation = Simulation(seeded(1), faults=plan)

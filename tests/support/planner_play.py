@@ -208,7 +208,7 @@ class Play:
             yield "cut", apart(part.cost_s[there], time_s), STATED
             yield "cut", apart(part.remaining_s[there], rest_s), STATED
         yield "optimum", above(best_s[there], time_s), FLOAT64
-        if self.tree.strategy.is_exact and not self.has_worker:
+        if (self.config.strategy in ("full", "exact") or self.tree._tree.exact) and not self.has_worker:
             weight = self.config.length_weight
             asked = time_s + weight * whole.length_m[there]
             yield "exact", above(asked, self.best_s(weight)[there]), self.grid.cells * 2.0**-23

@@ -141,8 +141,8 @@ class SwarmSide(Section, frozen=True, kw_only=True):
 class TopicSettings(Section, frozen=True, kw_only=True):
     """Changes to a forwarded topic.
 
-    topic  its name in ROS, with {vehicle} or {target} as above; default: as above
-    hz     highest rate; 0: as above
+    topic  its name in ROS, with {vehicle} or {target}; default: as in the list of topics
+    hz     highest rate; 0: as in that list
     """
 
     topic: str = ""

@@ -164,7 +164,7 @@ class Obstacle(Message, frozen=True, kw_only=True, tag=schema_of("body")):
     """Position of an obstacle that vehicles must not drive into: a disc on the map. The newest replaces the older.
 
     group          whose it is, for those who watch
-    incarnation    when its sender started, in ns: of two senders under one id the later counts
+    incarnation    when its sender started, in ns: two senders under one id are two obstacles
     seq            grows with each message of an incarnation
     stamp_ns       when it was there; not used
     x_m, y_m       in the terrain's frame, as of a `TargetPose`

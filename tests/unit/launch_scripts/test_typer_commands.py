@@ -245,11 +245,11 @@ def test_a_command_whose_streams_are_closed_ends_without_a_traceback() -> None:
     assert done.stderr.count(b"\n") == 1
 
 
-def test_a_command_that_may_use_no_more_memory_says_so_in_a_sentence() -> None:
+def test_a_command_for_which_there_is_no_memory_says_so_in_a_sentence() -> None:
     run = "from launch_scripts import typer_commands as all; exit(all.run_command(lambda: bytes(1 << 62)))"
     done = subprocess.run([sys.executable, "-c", run], capture_output=True, text=True)
     assert (done.returncode, done.stdout) == (1, "")
-    assert done.stderr == "swarm: this takes more memory than a process may use here (ulimit -v)\n"
+    assert done.stderr == "swarm: there is not enough memory for this (`ulimit -v` may be the limit)\n"
 
 
 @pytest.mark.parametrize("code", [130, None])

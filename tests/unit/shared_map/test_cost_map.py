@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from shared_map.cost_map import MAX_WINDOWS, CostMap, cluster, merged
+from shared_map.terrain.pace_layers import inflate, inflation_halves, spread
 from shared_map.terrain.terrain import Terrain, terrain_of_pace
 from swarm.grid import Window
 from swarm.wire.messages.map_data import MarkKind
@@ -128,3 +129,19 @@ def test_merged_windows_are_the_least_that_cover_all_and_do_not_touch(old: list[
         slow = [each for each in slow if each not in pair] + [pair[0].union(pair[1])]
     found = merged(new, others)
     assert sorted(map(astuple, found)) == sorted(map(astuple, slow))
+
+
+def test_a_vehicle_that_fits_its_cell_inflates_nothing() -> None:
+    assert inflation_halves(4.9, 10.0) == []
+    assert inflation_halves(0.0, 10.0) == []
+    assert inflation_halves(5.1, 10.0) == [1, 0]
+
+
+def test_spread_at_the_border_wraps_around_nothing() -> None:
+    lethal = np.zeros((5, 6), bool)
+    lethal[0, 0] = True
+    wide = spread(lethal, inflation_halves(16.0, 10.0))
+    assert wide.sum() == 8  # the far corner is 21 m away
+    assert wide[:3, :3].sum() == 8
+    pace = np.where(lethal, np.inf, 1).astype(np.float32)
+    assert np.isinf(inflate(pace, [])).sum() == 1

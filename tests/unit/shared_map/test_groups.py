@@ -12,7 +12,7 @@ from swarm.config.scenario import Scenario, readable_groups
 from swarm.config.scenario_files import parse_scenario
 from swarm.grid import GridSpec
 from swarm.runtime.order_book import OrderBook
-from swarm.wire.messages.map_data import MarkKind
+from swarm.wire.messages.map_data import MarkKind, MarkSet
 from swarm.wire.messages.orders import Order
 from swarm.wire.topics import MARKS
 
@@ -30,6 +30,35 @@ def scenario_of(policy: dict[str, tuple[list[str], list[str]]]) -> Scenario:
 
 lists = st.lists(st.sampled_from([*NAMES, "*"]), max_size=3, unique=True)
 policies = st.fixed_dictionaries({name: st.tuples(lists, lists) for name in NAMES})
+
+
+def writer(group: str) -> MapReplica:
+    return MapReplica(GRID, author=f"{group}.a0.1", group=group, publish_hz=1000.0)
+
+
+@given(
+    st.sets(st.sampled_from(NAMES)),
+    st.lists(st.tuples(st.sampled_from(NAMES), st.integers(0, GRID.cells - 1)), max_size=25),
+    st.randoms(use_true_random=False),
+)
+def test_a_replica_that_reads_some_groups_equals_one_to_which_only_they_spoke(read, said, chance):
+    writers = {name: writer(name) for name in NAMES}
+    heard: list[MarkSet] = []
+    for now_ns, (name, cell) in enumerate(said):
+        heard += writers[name].write([cell], [MarkKind.LETHAL], [0.0], 10_000_000 * now_ns)
+    limited = MapReplica(GRID, filter=MarkFilter(GRID, frozenset(read)))
+    told = MapReplica(GRID)
+    chance.shuffle(heard)  # type: ignore[attr-defined]
+    for each in heard:
+        limited.merge([each])
+        if each.group in read:
+            told.merge([each])
+    assert limited.held.fingerprint() == told.held.fingerprint()
+    assert limited.counts["sets_foreign"] == sum(each.group not in read for each in heard)
+    everything = MapReplica(GRID)
+    everything.merge(heard)
+    # A digest of all is no reason to ask for what would be refused.
+    assert limited.missing(everything.held.ledger.held()) == []
 
 
 @given(policies, st.sampled_from(NAMES), st.sampled_from(NAMES))

@@ -88,9 +88,12 @@ def test_a_cell_outside_the_grid_is_a_bug_that_raises(wrong):
             use(wrong)
 
 
-def test_a_walk_has_eight_directions():
-    with pytest.raises(ValueError, match="code 9"):
-        walk(GridSpec(2, 3, 1.0), 0, bytes([9]))
+def test_a_walk_has_eight_directions_and_stays_on_the_grid():
+    with pytest.raises(ValueError, match="code 8"):
+        walk(GridSpec(2, 3, 1.0), 0, bytes([8]))
+    for start, code in ((0, 0), (2, 2), (5, 4), (3, 6)):  # north, east, south, west
+        with pytest.raises(OutsideGridError):
+            walk(GridSpec(2, 3, 1.0), start, bytes([code]))
 
 
 @pytest.mark.parametrize(
