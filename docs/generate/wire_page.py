@@ -21,7 +21,7 @@ from swarm.config.explain import meanings
 from swarm.wire import codec, topics
 from swarm.wire.access import MEMBERS, MEMBERS_OWN, OPERATOR, Grant
 from swarm.wire.fields import Characters, Column, taken_apart
-from swarm.wire.messages import WIRE_VERSION, Message, Nothing
+from swarm.wire.messages import WIRE_VERSION, Message
 from swarm.wire.messages.map_data import SEQ_STEP, MarkKind
 from swarm.wire.messages.vehicles import VehicleState
 from swarm.wire.route_columns import RouteStatus
