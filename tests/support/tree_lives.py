@@ -124,7 +124,7 @@ class Life:
             whole = self._tree.routes(every)
             cut = self._tree.routes(every, int(self._rng.integers(1, 12)))
         self._findings.checks += 2 * every.size
-        for law, off, allowed in self._play.measured(whole, cut):
+        for law, off, allowed in self._play.measured(self._play.best_s(), whole, cut):
             self._note(law, off, allowed)
         self._check_alone(whole, cut, np.flatnonzero((whole.statuses == OK) & (cut.statuses == OK)))
 
