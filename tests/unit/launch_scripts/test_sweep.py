@@ -375,7 +375,7 @@ def test_a_long_partition_is_noticed_after_the_lease_and_heals_a_moment_after_it
 
 def test_a_short_partition_is_only_silence():
     model = links(partitions=(Partition(5, 6, ("a",)),))
-    assert heard(model, "b", (5.5, 6.0)) == "-+"
+    assert heard(model, "b", (5.5, 6.0)) == heard(model, "a", (5.5, 6.0), of="b") == "-+"
     assert all(model.connected("a", "b", at(t / 10)) for t in range(100))
 
 
