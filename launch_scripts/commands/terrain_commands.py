@@ -25,10 +25,10 @@ from shared_map.terrain.pace_layers import TerrainClass
 from shared_map.terrain.slope_and_climb import said_of_cost
 from shared_map.terrain.terrain import Terrain, build_terrain
 from shared_map.terrain.terrain_report import facts_of, lines_of, notes_and_doubts
-from swarm.config.ground import TerrainConfig
+from swarm.config.ground import CostConfig, TerrainConfig
 from swarm.config.scenario import Scenario
 from swarm.config.setting_types import ElevationEncoding
-from swarm.config.vehicle_classes import cost_of_preset, of_class
+from swarm.config.vehicle_classes import of_class
 from swarm.errors import ConfigError
 from swarm.grid import GridSpec
 
@@ -85,7 +85,7 @@ def info(
         scenario = find_scenario(file, preset)
     else:
         ground = msgspec.convert({"source": file, **given}, TerrainConfig)
-        scenario = Scenario(terrain=ground, cost=cost_of_preset(preset))
+        scenario = Scenario(terrain=ground, cost=CostConfig(preset=preset))
     with progress() as tell:
         terrain = build_terrain(scenario, tell)
     rule = {"slope_rule": scenario.cost.slope_rule, "preset": scenario.cost.preset or "none"}
