@@ -89,17 +89,15 @@ def info(
     with progress() as tell:
         terrain = build_terrain(scenario, tell)
     rule = {"slope_rule": scenario.cost.slope_rule, "preset": scenario.cost.preset or "none"}
-    facts = {**facts_of(terrain), "crs": _crs_name(terrain.grid), **rule}
+    facts = {**facts_of(terrain), **rule}
     notes, doubts = notes_and_doubts(terrain, facts)
     if as_json:
         zones = [zone.as_json(terrain.grid.cells) for zone in terrain.zones]
         console.print_json(json.dumps({**facts, "zones": zones, "notes": notes, "doubts": doubts}))
         return
-    table = Table(show_header=False, box=None)
     for key, value in facts.items():
         shown = ", ".join(f"{k} {v:.1%}" for k, v in value.items()) if isinstance(value, dict) else str(value)
-        table.add_row(key, shown)
-    console.print(table)
+        _say(f" {key:19}  {shown}")
     _say(*lines_of(notes, doubts))
 
 
@@ -112,16 +110,6 @@ def _say(*lines: str) -> None:
 def _say_written(**files: Path | None) -> None:
     """Names the files which a command has written: `cost: cost.tif`."""
     _say(*(f"{what}: {path}" for what, path in files.items() if path is not None))
-
-
-def _crs_name(grid: GridSpec) -> str:
-    if len(grid.crs) < 60:
-        return grid.crs
-    import rasterio
-
-    from shared_map.importers.georeference import crs_name
-
-    return crs_name(rasterio.CRS.from_user_input(grid.crs))
 
 
 @command(app)
