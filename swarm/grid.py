@@ -29,8 +29,6 @@ MOST_SHARD_REGIONS = 64
 MOST_SHARDS = 1 << 21
 """Numbers of shards are less."""
 
-_EARTH_M = 6_371_000.0
-"""Mean radius of the Earth."""
 MAX_CELLS = 16384 * 16384
 """A larger grid is refused wherever one comes from outside."""
 
@@ -121,8 +119,8 @@ class Window:
 
 
 def is_of_earth(radius_m: float) -> bool:
-    """Returns True if a radius is that of an ellipsoid of the Earth: within a hundredth, and no moon or planet."""
-    return abs(radius_m - _EARTH_M) < 0.01 * _EARTH_M
+    """Returns True if a radius is within a hundredth of the Earth's mean radius: of no moon or other planet."""
+    return abs(radius_m / 6_371_000 - 1) < 0.01
 
 
 @dataclass(frozen=True, slots=True)

@@ -58,7 +58,9 @@ def _told() -> dict[str, list[str]]:
 
 def _meant(values: type[enum.Enum]) -> dict[str, str]:
     """Name of a value -> what it means, by the docstring below it."""
-    found = re.findall(r'^    (\w+) = [^\n]+\n    """(.+?)\.?"""', inspect.getsource(values), re.DOTALL | re.MULTILINE)
+    found = re.findall(
+        r'^    (\w+) = [^\n]+\n    """(.+?)\.?"""', inspect.getsource(values), re.DOTALL | re.MULTILINE
+    )
     return {name: " ".join(text.split()) for name, text in found}
 
 

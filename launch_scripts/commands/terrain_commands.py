@@ -88,8 +88,7 @@ def info(
         scenario = Scenario(terrain=ground, cost=CostConfig(preset=preset))
     with progress() as tell:
         terrain = build_terrain(scenario, tell)
-    rule = {"slope_rule": scenario.cost.slope_rule, "preset": scenario.cost.preset or "none"}
-    facts = {**facts_of(terrain), **rule}
+    facts = {**facts_of(terrain), "slope_rule": scenario.cost.slope_rule, "preset": scenario.cost.preset or "none"}
     notes, doubts = notes_and_doubts(terrain, facts)
     if as_json:
         zones = [zone.as_json(terrain.grid.cells) for zone in terrain.zones]

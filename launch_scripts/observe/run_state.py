@@ -71,16 +71,8 @@ def factors(value: Mapping[str, float]) -> str:
     return ", ".join(f"{name} x {factor:.2g}" for name, factor in value.items()) or "nothing"
 
 
-def _until_resumed(vehicles: int) -> str:
-    return f"{number_of(vehicles, 'vehicle')} and all simulated targets, until swarm resume"
-
-
 def _until_started(vehicles: Sequence[str]) -> str:
     return f"{number_of(len(vehicles), 'vehicle')} ({first_of(vehicles)}), until swarm order vehicle start NAME"
-
-
-def _mean_gap(value: CertifiedGap) -> str:
-    return percent(value.mean)
 
 
 @dataclass(frozen=True, slots=True)
@@ -140,7 +132,7 @@ class TargetLine:
     following: Annotated[int, Fact("chased by", count)]
     nearest_m: Annotated[float | None, Fact("nearest", distance)]
     captures: Annotated[int, Fact("captures", count)]
-    gap: Annotated[CertifiedGap | None, Fact("certified gap", _mean_gap)]
+    gap: Annotated[CertifiedGap | None, Fact("certified gap", lambda gap: percent(gap.mean))]
     growths: Annotated[int | None, Fact("re-plans", count)]
     growth_ms: Annotated[float | None, Fact("tree", duration)]
     routes_served: Annotated[int | None, Fact("served", count, always=False)]
@@ -204,7 +196,7 @@ class RunState:
     states: Annotated[dict[str, int], Fact("of these", each)]
     classes: Annotated[dict[str, int], Fact("classes", each)]
     following: Annotated[int, Fact("assigned", count)]
-    paused: Annotated[int, Fact("paused", _until_resumed)]
+    paused: Annotated[int, Fact("paused", "all {} vehicles and simulated targets, until swarm resume".format)]
     stopped: Annotated[tuple[str, ...], Fact("stopped", _until_started)]
     sent: Annotated[dict[str, int], Fact("sent to places", each)]
     external: Annotated[tuple[str, ...], Fact("external vehicles", first_of)]

@@ -205,8 +205,7 @@ class _WithPreset(SectionType):
     """A section which, made in Python, has its preset's values, as from a file. Raises ConfigError on no preset."""
 
     def __call__(self, *args: Any, **settings: Any) -> Any:
-        name = settings.get("preset")
-        if name not in (None, *PRESETS):
+        if (name := settings.get("preset")) not in (None, *PRESETS):
             raise ConfigError(f"no preset {quoted(name)}{choice(str(name), list(PRESETS), ' there are ')}")
         return super().__call__(*args, **whole_cost({}, settings))
 

@@ -355,7 +355,7 @@ def test_every_view_says_who_stands_by_order_and_what_ends_that() -> None:
     freed = Order(subject="vehicle", name="a0-01", stamp_ns=1, off=True)
     assert "until" not in told(freed)
     text = told(Order(subject="pause", name="", stamp_ns=1), Order(subject="vehicle", name="a0-00", stamp_ns=1))
-    assert "paused 2 vehicles and all simulated targets, until swarm resume\n" in text
+    assert "paused all 2 vehicles and simulated targets, until swarm resume\n" in text
     assert "stopped 1 vehicle (a0-00), until swarm order vehicle start NAME\n" in text
     assert "paused" not in told(Order(subject="pause", name="", stamp_ns=2, off=True))
 
