@@ -85,7 +85,7 @@ def info(
         scenario = find_scenario(file, preset)
     else:
         ground = msgspec.convert({"source": file, **given}, TerrainConfig)
-        scenario = Scenario(terrain=ground, cost=CostConfig(preset=preset))
+        scenario = Scenario(terrain=ground, cost=CostConfig(preset=preset))  # type: ignore[arg-type]  # which it checks
     with progress() as tell:
         terrain = build_terrain(scenario, tell)
     facts = {**facts_of(terrain), "slope_rule": scenario.cost.slope_rule, "preset": scenario.cost.preset or "none"}

@@ -41,7 +41,7 @@ def find_scenario(name: str, preset: str | None = None, crs: str | None = None) 
     path = Path(name)
     if os.path.isfile(name) and is_terrain(path):
         ground = TerrainConfig(source=name, crs=crs)
-        return Scenario(name=path.stem, terrain=ground, cost=CostConfig(preset=preset))
+        return Scenario(name=path.stem, terrain=ground, cost=CostConfig(preset=preset))  # type: ignore[arg-type]  # which it checks
     for option, given, key in (("--preset", preset, "cost.preset"), ("--crs", crs, "terrain.crs")):
         if given is not None:
             raise ConfigError(f"{option} goes with a terrain file: in the scenario {name} set {key}")
