@@ -3,7 +3,7 @@ others."""
 
 import math
 from pathlib import Path
-from typing import get_args
+from typing import Any, get_args
 
 import numpy as np
 import pytest
@@ -212,7 +212,7 @@ def test_a_terrain_says_its_rule_and_its_preset() -> None:
 
 
 @pytest.mark.parametrize("name", PRESETS)
-def test_a_preset_is_a_scenario_that_fits_together(name: str) -> None:
+def test_a_preset_is_a_scenario_that_fits_together(name: Any) -> None:
     cost = CostConfig(preset=name)
     assert list(cost_faults(cost, "cost")) == []
     assert {key: getattr(cost, key) for key in PRESETS[name]} == PRESETS[name]
@@ -242,7 +242,7 @@ def test_settings_of_a_scenario_win_over_those_of_its_preset_key_by_key() -> Non
 )
 @settings(max_examples=few(60))
 def test_a_preset_and_own_settings_mean_the_same_in_python_and_in_a_file(
-    preset: str | None, own: dict[str, object]
+    preset: str | None, own: dict[str, Any]
 ) -> None:
     given = own if preset is None else {"preset": preset, **own}
     assert CostConfig(**given) == parse_scenario("", settings={"cost": given}).cost
