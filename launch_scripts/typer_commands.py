@@ -248,6 +248,9 @@ _NO_PATHS = (errno.ENAMETOOLONG, errno.ELOOP, errno.EACCES, errno.EPERM, errno.E
 """Errors about a path that cannot be one, or not for this user."""
 _NO_ROOM = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EROFS)
 
+_NO_MEMORY = ("failed to map segment", "annot allocate memory", "can't start new thread")
+"""Words of the loader, of the system and of Python where a library, a file or a thread finds no memory."""
+
 
 def run_command(command: Callable[[], Any], name: str = "swarm") -> int:
     """Runs the command that is made here. Returns its exit code; a fault of the user, a file or the network is
@@ -264,6 +267,10 @@ def run_command(command: Callable[[], Any], name: str = "swarm") -> int:
     try:
         try:
             code = command().main(prog_name=name, standalone_mode=False)
+        except (ImportError, OSError, RuntimeError) as error:
+            if not any(words in str(error) for words in _NO_MEMORY):
+                raise
+            raise MemoryError from error
         finally:
             sys.stdout.flush()
     except TyperException as error:

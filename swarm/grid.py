@@ -118,6 +118,11 @@ class Window:
         )
 
 
+def is_of_earth(radius_m: float) -> bool:
+    """Returns True if a radius is within a hundredth of the Earth's mean radius: of no moon or other planet."""
+    return abs(radius_m / 6_371_000 - 1) < 0.01
+
+
 @dataclass(frozen=True, slots=True)
 class GridSpec:
     """Shape and place of the terrain.

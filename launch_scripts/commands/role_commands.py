@@ -13,7 +13,7 @@ import msgspec
 import typer
 
 from launch_scripts.commands import shared_options
-from launch_scripts.typer_commands import ADMIN, command, complete_scenarios
+from launch_scripts.typer_commands import ADMIN, command
 from swarm.errors import ConfigError
 from swarm.peers import ranked_id
 
@@ -34,14 +34,7 @@ class Part(shared_options.Tls):
     """
 
     panel: ClassVar[str | None] = None
-    scenario: Annotated[
-        str,
-        typer.Argument(
-            metavar="SCENARIO",
-            help="A .toml file or a built-in name; the same for all roles of a run.",
-            autocompletion=complete_scenarios,
-        ),
-    ] = "jacksboro"
+    scenario: shared_options.ScenarioArgument = "jacksboro"
     connect: str | None = None
     namespace: shared_options.Namespace = None
     runs: shared_options.Runs = Path("runs")

@@ -54,14 +54,16 @@ ScenarioArgument = Annotated[
     str,
     typer.Argument(
         metavar="SCENARIO",
-        help="A .toml file, or a built-in scenario such as jacksboro.",
+        help="A .toml file, or a built-in scenario such as jacksboro, which `swarm role` takes by default.",
+        show_default=False,
         autocompletion=complete_scenarios,
     ),
 ]
 Namespace = Annotated[
     str | None, from_environment("SWARM_NAMESPACE", help="Prefix of all keys: runs in different ones do not meet.")
 ]
-Runs = Annotated[Path, from_environment("SWARM_RUNS", help="Folder that holds a folder for each run.")]
+_RUNS = {"help": "Folder of runs. Default: ./runs; for a running swarm, all your runs on this machine."}
+Runs = Annotated[Path, from_environment("SWARM_RUNS", **_RUNS, show_default=False)]
 AsJson = Annotated[bool, typer.Option("--json", help="Print JSON on standard output, all else on standard error.")]
 PortOption = Annotated[
     int | None,
@@ -130,7 +132,7 @@ class Tls:
 # --- the running swarm that a command asks ----------------------------------------------------------------------
 
 RunOption = Annotated[str | None, from_environment("SWARM_RUN", autocompletion=complete_runs)]
-RunsHere = Annotated[Path | None, from_environment("SWARM_RUNS")]
+RunsHere = Annotated[Path | None, from_environment("SWARM_RUNS", **_RUNS)]
 _CONNECT_S = 3.0
 """Time for a command to reach a router. Chosen, not measured."""
 _NEWEST = 50
@@ -146,7 +148,6 @@ class Where(Tls):
     connect    The router's endpoint, such as tls/HOST:7447; by default that of the run.
     namespace  Prefix of all keys: runs in different ones do not meet.
     run        Name or folder of the run to ask, if several run here.
-    runs       Folder of runs to search. Default: all your runs on this machine.
     """
 
     panel: ClassVar[str | None] = NETWORK

@@ -25,10 +25,10 @@ from shared_map.terrain.pace_layers import TerrainClass
 from shared_map.terrain.slope_and_climb import said_of_cost
 from shared_map.terrain.terrain import Terrain, build_terrain
 from shared_map.terrain.terrain_report import facts_of, lines_of, notes_and_doubts
-from swarm.config.ground import TerrainConfig
+from swarm.config.ground import CostConfig, TerrainConfig
 from swarm.config.scenario import Scenario
 from swarm.config.setting_types import ElevationEncoding
-from swarm.config.vehicle_classes import cost_of_preset, of_class
+from swarm.config.vehicle_classes import of_class
 from swarm.errors import ConfigError
 from swarm.grid import GridSpec
 
@@ -85,21 +85,18 @@ def info(
         scenario = find_scenario(file, preset)
     else:
         ground = msgspec.convert({"source": file, **given}, TerrainConfig)
-        scenario = Scenario(terrain=ground, cost=cost_of_preset(preset))
+        scenario = Scenario(terrain=ground, cost=CostConfig(preset=preset))  # type: ignore[arg-type]  # which it checks
     with progress() as tell:
         terrain = build_terrain(scenario, tell)
-    rule = {"slope_rule": scenario.cost.slope_rule, "preset": scenario.cost.preset or "none"}
-    facts = {**facts_of(terrain), "crs": _crs_name(terrain.grid), **rule}
+    facts = {**facts_of(terrain), "slope_rule": scenario.cost.slope_rule, "preset": scenario.cost.preset or "none"}
     notes, doubts = notes_and_doubts(terrain, facts)
     if as_json:
         zones = [zone.as_json(terrain.grid.cells) for zone in terrain.zones]
         console.print_json(json.dumps({**facts, "zones": zones, "notes": notes, "doubts": doubts}))
         return
-    table = Table(show_header=False, box=None)
     for key, value in facts.items():
         shown = ", ".join(f"{k} {v:.1%}" for k, v in value.items()) if isinstance(value, dict) else str(value)
-        table.add_row(key, shown)
-    console.print(table)
+        _say(f" {key:19}  {shown}")
     _say(*lines_of(notes, doubts))
 
 
@@ -112,16 +109,6 @@ def _say(*lines: str) -> None:
 def _say_written(**files: Path | None) -> None:
     """Names the files which a command has written: `cost: cost.tif`."""
     _say(*(f"{what}: {path}" for what, path in files.items() if path is not None))
-
-
-def _crs_name(grid: GridSpec) -> str:
-    if len(grid.crs) < 60:
-        return grid.crs
-    import rasterio
-
-    from shared_map.importers.georeference import crs_name
-
-    return crs_name(rasterio.CRS.from_user_input(grid.crs))
 
 
 @command(app)

@@ -22,11 +22,10 @@ from launch_scripts.web import LOOPBACK
 from shared_map.importers.terrain_sources import FILE_KINDS, is_terrain
 from swarm.clock import date_ns
 from swarm.config.explain import choice, converted, nearest
-from swarm.config.ground import TerrainConfig
+from swarm.config.ground import CostConfig, TerrainConfig
 from swarm.config.input_files import FileKind, check_bytes, quoted
 from swarm.config.scenario import MonitorConfig, NetworkConfig, Scenario, TlsConfig
 from swarm.config.scenario_files import load_scenario
-from swarm.config.vehicle_classes import cost_of_preset
 from swarm.endpoints import check_endpoint
 from swarm.errors import ConfigError, StoreError
 from swarm.files import check_writable, make_folder, writing
@@ -42,7 +41,7 @@ def find_scenario(name: str, preset: str | None = None, crs: str | None = None) 
     path = Path(name)
     if os.path.isfile(name) and is_terrain(path):
         ground = TerrainConfig(source=name, crs=crs)
-        return Scenario(name=path.stem, terrain=ground, cost=cost_of_preset(preset))
+        return Scenario(name=path.stem, terrain=ground, cost=CostConfig(preset=preset))  # type: ignore[arg-type]  # which it checks
     for option, given, key in (("--preset", preset, "cost.preset"), ("--crs", crs, "terrain.crs")):
         if given is not None:
             raise ConfigError(f"{option} goes with a terrain file: in the scenario {name} set {key}")

@@ -71,8 +71,8 @@ def factors(value: Mapping[str, float]) -> str:
     return ", ".join(f"{name} x {factor:.2g}" for name, factor in value.items()) or "nothing"
 
 
-def _mean_gap(value: CertifiedGap) -> str:
-    return percent(value.mean)
+def _until_started(vehicles: Sequence[str]) -> str:
+    return f"{number_of(len(vehicles), 'vehicle')} ({first_of(vehicles)}), until swarm order vehicle start NAME"
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,7 +132,7 @@ class TargetLine:
     following: Annotated[int, Fact("chased by", count)]
     nearest_m: Annotated[float | None, Fact("nearest", distance)]
     captures: Annotated[int, Fact("captures", count)]
-    gap: Annotated[CertifiedGap | None, Fact("certified gap", _mean_gap)]
+    gap: Annotated[CertifiedGap | None, Fact("certified gap", lambda gap: percent(gap.mean))]
     growths: Annotated[int | None, Fact("re-plans", count)]
     growth_ms: Annotated[float | None, Fact("tree", duration)]
     routes_served: Annotated[int | None, Fact("served", count, always=False)]
@@ -165,6 +165,8 @@ class RunState:
     states              vehicles that are driven, by VehicleState
     classes             the same by class, "ground" first
     following           vehicles that have a target
+    paused              vehicles which the order to pause stops; 0 if the run is not paused
+    stopped             ids of vehicles which an order to them stops
     sent                vehicles that were sent to places, by the state of their goals
     external            ids of external vehicles and other obstacles which report their places now
     captures            how often targets were caught
@@ -194,6 +196,8 @@ class RunState:
     states: Annotated[dict[str, int], Fact("of these", each)]
     classes: Annotated[dict[str, int], Fact("classes", each)]
     following: Annotated[int, Fact("assigned", count)]
+    paused: Annotated[int, Fact("paused", "all {} vehicles and simulated targets, until swarm resume".format)]
+    stopped: Annotated[tuple[str, ...], Fact("stopped", _until_started)]
     sent: Annotated[dict[str, int], Fact("sent to places", each)]
     external: Annotated[tuple[str, ...], Fact("external vehicles", first_of)]
     captures: Annotated[int | None, total("captures")]
@@ -246,6 +250,7 @@ def state_of(latest: LatestState, now_ns: int) -> RunState:
     crew = latest.plan.crew_now(targets)
     needed = set(crew)
     vehicles = latest.driven(needed, now_ns)
+    planned = max(latest.plan.vehicles, len(vehicles))
     well = [latest.fills(role, id) for role, id in crew]
     began_ns, goals = latest.began_ns, latest.goals()
     expected, alive = Counter(role for role, _ in crew), Counter[str]()
@@ -256,7 +261,7 @@ def state_of(latest: LatestState, now_ns: int) -> RunState:
         targets=_lines(latest, targets, vehicles, now_ns),
         states=vehicles.count_states(),
         classes=_by_class(vehicles.ids, latest.classes()),
-        vehicles_driven=(len(vehicles), max(latest.plan.vehicles, len(vehicles))),
+        vehicles_driven=(len(vehicles), planned),
         following=int(np.count_nonzero(vehicles.targets >= 0)),
         messages_now_per_s=latest.now_of(MESSAGES_PER_S),
         processes_well=(sum(well), len(crew)),
@@ -269,6 +274,8 @@ def state_of(latest: LatestState, now_ns: int) -> RunState:
         learned=_learned(latest),
         alarms=alarms_of(latest, targets, now_ns),
         orders=tuple(map(plain, latest.book.standing)),
+        paused=planned if latest.book.paused else 0,
+        stopped=tuple(each.name for each in latest.book if each.subject == "vehicle" and not each.off),
         sent=dict(Counter(goal.state for goal in goals)),
         goals=tuple(goals),
         **{fact.name: latest.total(fact.name) for fact in FACTS if fact.is_total},
@@ -334,7 +341,7 @@ LINES: tuple[tuple[str, ...], ...] = (
     ("processes_well", "restarts", "messages_now_per_s"),
 )
 """Lines in which the facts of a run are set."""
-IF_ANY = ("learned", "sent", "external", "processes_ended")
+IF_ANY = ("paused", "stopped", "learned", "sent", "external", "processes_ended")
 """Facts that have a line of their own, where there is anything to say."""
 MUST_BE_ZERO = ("collisions", "lethal_entries", "driven_into", "hit_by_obstacles", "payloads_dropped")
 """Facts that are shown only where they are not 0."""

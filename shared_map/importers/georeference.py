@@ -28,7 +28,7 @@ from shared_map.importers.raster_files import READ_ROWS
 from shared_map.terrain.row_bands import Progress, bands, no_progress
 from swarm.config.input_files import FileKind, read_text
 from swarm.errors import TerrainError
-from swarm.grid import MAX_CELLS, GridSpec
+from swarm.grid import MAX_CELLS, GridSpec, is_of_earth
 
 MAX_SPAN_DEG = 12.0
 """Beyond this, a local projection stretches by more than half a percent at its borders."""
@@ -36,8 +36,6 @@ MOST_STRETCH = 0.02
 """Mercator's metres, and those of maps in equal degrees, are true on one line only."""
 _LIKE_WGS84 = (4326, 4258, 4269)
 """Degrees within a metre of WGS 84's. Those of other datums PROJ has to move, for which it needs the datum."""
-_EARTH_M = 6_371_000.0
-"""Mean radius of the Earth: a radius within a hundredth of it is that of an ellipsoid of the Earth."""
 METRES = 'LOCAL_CS["image",UNIT["metre",1]]'
 """Coordinate system of a terrain without a place on Earth."""
 HIGHEST_DEG = 85.0
@@ -187,7 +185,7 @@ def _shape_of(crs: Any) -> str:
     """The body that a system lies on, for PROJ: the Earth, or the ellipsoid of another planet or moon."""
     known = crs.to_dict()
     radius_m = known.get("R", known.get("a"))
-    if radius_m is None or abs(float(radius_m) - _EARTH_M) < 0.01 * _EARTH_M:
+    if radius_m is None or is_of_earth(float(radius_m)):
         return "+datum=WGS84"
     flat = float(known.get("rf") or math.inf)
     polar_m = float(known.get("b", float(radius_m) * (1 - 1 / flat)))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import Any
 
 import numpy as np
@@ -9,7 +10,7 @@ import numpy as np
 from shared_map.terrain.map_frame import MapFrame
 from shared_map.terrain.pace_layers import TerrainClass, largest_part, slope_deg
 from shared_map.terrain.terrain import Terrain
-from swarm.grid import GridSpec
+from swarm.grid import GridSpec, is_of_earth
 from swarm.places import bounds_of, extent_of
 
 _MOST_SIDE = 2048
@@ -93,7 +94,9 @@ def doubts_about(facts: dict[str, Any]) -> list[str]:
             f"half of the ground is steeper than {facts['slope_median_deg']:g} degrees; are heights in metres"
             " (terrain.height_scale), and cells (terrain.crs)?"
         )
-    deep = facts.get("lowest_m", 0.0) < _LOWEST_LAND_M and not any(body in facts["crs"] for body in ("+a=", "+R="))
+    radius = re.search(r"\+[aR]=([0-9.]+)", facts["crs"])
+    on_earth = radius is None or is_of_earth(float(radius[1]))
+    deep = on_earth and facts.get("lowest_m", 0.0) < _LOWEST_LAND_M
     if deep and facts["class_shares"].get("water", 0.0) < facts.get("below_sea_share", 0.0):
         doubts.append(
             f"heights go down to {facts['lowest_m']:g} m, where no dry land is: a sea floor is ground here, unless"

@@ -9,13 +9,11 @@ from textwrap import shorten
 from typing import Any
 
 from swarm.errors import ArgumentError, ConfigError, missing
-from swarm.grid import GridSpec, real, shown, whole
+from swarm.grid import GridSpec, is_of_earth, real, shown, whole
 from swarm.places import Given, cell_of, written
 from swarm.wire.messages.processes import RunInfo
 
 WGS84 = "EPSG:4326"
-_EARTH_M = 6_371_000.0
-"""Mean radius of the Earth: a planet or moon within 1 % of it is taken for the Earth."""
 Point = tuple[float, float]
 _Transform = Callable[[float, float], Point]
 
@@ -122,7 +120,7 @@ class Frame:
 def _degrees_of(system: Any) -> str:
     """Returns the geographic system of the planet or moon of a coordinate system: WGS 84 on the Earth."""
     ellipsoid = system.ellipsoid
-    if ellipsoid is None or abs(ellipsoid.semi_major_metre - _EARTH_M) < 0.01 * _EARTH_M:
+    if ellipsoid is None or is_of_earth(ellipsoid.semi_major_metre):
         return WGS84
     return f"+proj=longlat +a={ellipsoid.semi_major_metre!r} +b={ellipsoid.semi_minor_metre!r} +no_defs"
 

@@ -2,11 +2,16 @@
 
 from __future__ import annotations
 
-from typing import Annotated, Literal
+import tomllib
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Annotated, Any, Literal
 
 import msgspec
 from msgspec import Meta
 
+from swarm.config.explain import choice
+from swarm.config.input_files import quoted
 from swarm.config.setting_types import (
     ClassName,
     CoverCode,
@@ -19,11 +24,13 @@ from swarm.config.setting_types import (
     Positive,
     Preset,
     Section,
+    SectionType,
     Slope,
     SlopeFactor,
     SpeedOnGround,
     plugin_name,
 )
+from swarm.errors import ConfigError
 
 SlopeRule = Literal["linear", "quadratic", "energy", "tobler", "naismith_langmuir", "table"]
 
@@ -169,7 +176,41 @@ class CostLayerConfig(Section, frozen=True, kw_only=True):
     options: Options = msgspec.field(default_factory=dict)
 
 
-class CostConfig(Section, frozen=True, kw_only=True):
+PRESETS: Mapping[str, Mapping[str, Any]] = tomllib.loads(
+    Path(__file__).with_name("presets.toml").read_text("utf-8")
+)
+"""Every preset, by name: settings of `[cost]`, as a scenario would give them."""
+
+
+def whole_cost(common: dict[str, Any], own: dict[str, Any]) -> dict[str, Any]:
+    """Returns the settings of a cost: common ones, then those of its preset, then its own.
+
+    A value that is not of its type is left to the check of types.
+    """
+    name = own.get("preset")
+    preset = PRESETS.get(name, {}) if isinstance(name, str) else {}
+    named = {**preset, **own}
+    changes_rule = named.get("slope_rule", common.get("slope_rule")) != common.get("slope_rule")
+    tables = {"slope_table", "slope_csv"}
+    left_out = tables if changes_rule or tables & named.keys() else set()
+    below = {key: value for key, value in common.items() if key not in left_out}
+    cost = {**below, **named}
+    factors = [each.get("class_factor") for each in (common, preset, own)]
+    if any(isinstance(each, dict) for each in factors) and all(isinstance(each, dict | None) for each in factors):
+        cost["class_factor"] = {key: value for each in factors for key, value in (each or {}).items()}
+    return cost
+
+
+class _WithPreset(SectionType):
+    """A section which, made in Python, has its preset's values, as from a file. Raises ConfigError on no preset."""
+
+    def __call__(self, *args: Any, **settings: Any) -> Any:
+        if (name := settings.get("preset")) not in (None, *PRESETS):
+            raise ConfigError(f"no preset {quoted(name)}{choice(str(name), list(PRESETS), ' there are ')}")
+        return super().__call__(*args, **whole_cost({}, settings))
+
+
+class CostConfig(Section, metaclass=_WithPreset, frozen=True, kw_only=True):
     """Rules that turn terrain into pace (s/m).
 
     preset                  a kind of vehicle, whose values are the defaults of all other keys

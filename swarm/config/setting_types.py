@@ -69,7 +69,7 @@ CoverCode = Annotated[str, Meta(pattern=r"^[0-9]{1,5}\Z")]
 ElevationEncoding = Literal["metres"]
 
 
-class _Named(msgspec.StructMeta):
+class SectionType(msgspec.StructMeta):
     """Sections which, made in Python, say of an unknown keyword what they say of it in a file."""
 
     def __call__(self, *args: Any, **settings: Any) -> Any:
@@ -77,5 +77,5 @@ class _Named(msgspec.StructMeta):
         return super().__call__(*args, **settings)
 
 
-class Section(msgspec.Struct, metaclass=_Named, frozen=True, kw_only=True, forbid_unknown_fields=True):
+class Section(msgspec.Struct, metaclass=SectionType, frozen=True, kw_only=True, forbid_unknown_fields=True):
     """Base of the sections of a scenario."""

@@ -7,8 +7,6 @@ from __future__ import annotations
 
 import csv
 import math
-import tomllib
-from collections.abc import Mapping
 from itertools import pairwise
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -17,47 +15,13 @@ import msgspec
 from msgspec import Meta
 
 from swarm.config.explain import choice
-from swarm.config.ground import CostConfig, ZoneConfig
+from swarm.config.ground import CostConfig, ZoneConfig, whole_cost
 from swarm.config.input_files import FileKind, quoted, read_text
 from swarm.config.setting_types import Name, Positive, Section, Slope, SlopeFactor
 from swarm.errors import ConfigError
 
 if TYPE_CHECKING:
     from swarm.config.scenario import Scenario
-
-PRESETS: Mapping[str, Mapping[str, Any]] = tomllib.loads(
-    Path(__file__).with_name("presets.toml").read_text("utf-8")
-)
-"""Every preset, by name: settings of `[cost]`, as a scenario would give them."""
-
-
-def whole_cost(common: dict[str, Any], own: dict[str, Any]) -> dict[str, Any]:
-    """Returns the settings of a cost: common ones, then those of its preset, then its own.
-
-    A value that is not of its type is left to the check of types.
-    """
-    name = own.get("preset")
-    preset = PRESETS.get(name, {}) if isinstance(name, str) else {}
-    named = {**preset, **own}
-    changes_rule = named.get("slope_rule", common.get("slope_rule")) != common.get("slope_rule")
-    tables = {"slope_table", "slope_csv"}
-    left_out = tables if changes_rule or tables & named.keys() else set()
-    below = {key: value for key, value in common.items() if key not in left_out}
-    cost = {**below, **named}
-    factors = [each.get("class_factor") for each in (common, preset, own)]
-    if any(isinstance(each, dict) for each in factors) and all(isinstance(each, dict | None) for each in factors):
-        cost["class_factor"] = {key: value for each in factors for key, value in (each or {}).items()}
-    return cost
-
-
-def cost_of_preset(name: str | None) -> CostConfig:
-    """The cost of a scenario which says nothing but this preset, if that. Raises ConfigError on an unknown one."""
-    if name is None:
-        return CostConfig()
-    if not isinstance(name, str) or name not in PRESETS:
-        raise ConfigError(f"no preset {quoted(name)}{choice(str(name), list(PRESETS), ' there are ')}")
-    return msgspec.convert(whole_cost({}, {"preset": name}), CostConfig)
-
 
 # --- slope tables -------------------------------------------------------------------------------------------
 

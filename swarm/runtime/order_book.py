@@ -133,10 +133,6 @@ class OrderBook(Register[Key, Order]):
         """The order that stands about a subject; None if there is none, or it was taken back."""
         return self.in_force((subject, name))
 
-    def knows(self, subject: Subject, name: str, stamp_ns: int) -> bool:
-        """Returns True if an order of this timestamp about the subject, or a later one, is in the book."""
-        return self.has((subject, name), stamp_ns)
-
     @property
     def standing(self) -> list[str]:
         """Returns the orders in force, in words."""
@@ -253,7 +249,7 @@ def judged(
     if (fault := _fault(given, book, scenario, vehicles)) is not None:
         return fault
     before = book.about(given.subject, given.name)
-    full = len(book) >= MOST_ORDERS and not book.knows(given.subject, given.name, 0)
+    full = len(book) >= MOST_ORDERS and not book.has((given.subject, given.name), 0)
     if full and given.subject != "pause":
         return f"there are {len(book)} orders already, at most {MOST_ORDERS}"
     walk, speed_m_per_s, added = given.walk, given.speed_m_per_s, given.new
@@ -449,7 +445,7 @@ class OrderClient:
     def _knows(self, order: Obey) -> bool:
         if order.goals:
             return self._goals is not None and self._goals.has(order.name, order.stamp_ns)
-        return order.subject is None or self.book.knows(order.subject, order.name, order.stamp_ns)
+        return order.subject is None or self.book.has((order.subject, order.name), order.stamp_ns)
 
     def _ask(self, now_ns: int) -> None:
         self._ask_due_ns = now_ns + _ASK_AGAIN_NS

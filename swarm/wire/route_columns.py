@@ -41,9 +41,13 @@ class RouteStatus(enum.StrEnum):
     """State of a route from a cell: found, or the reason why not."""
 
     OK = "ok"
+    """A route leads there."""
     UNREACHABLE = "unreachable"
+    """No route leads there from this cell."""
     OUTSIDE = "outside"
+    """The cell is outside the terrain."""
     LETHAL_START = "lethal_start"
+    """The cell itself is lethal."""
     NO_TARGET = "no_target"
     """The planner does not know yet where the target is, or it is on a lethal cell or outside."""
     SEARCHING = "searching"

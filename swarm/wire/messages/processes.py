@@ -57,7 +57,7 @@ class RunInfo(Message, frozen=True, kw_only=True, tag=schema_of("run")):
 class Alarm(msgspec.Struct, frozen=True, kw_only=True):
     """Notice to people: a collision, an author beyond its quota.
 
-    kind     a word of `launch_scripts/observe/alarms.toml`; any other is shown as it is
+    kind     a kind in docs/reference/wire.md#values; any other word is shown as it is
     about    process, target, author or vehicle
     over_ns  when it ended; None while it lasts
     """

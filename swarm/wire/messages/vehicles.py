@@ -19,6 +19,7 @@ class VehicleState(enum.IntEnum):
     WAITING = 1
     """Has asked for a route."""
     FOLLOWING = 2
+    """Drives along its route."""
     ARRIVED = 3
     """Has its target within reach."""
     STRANDED = 4

@@ -245,8 +245,19 @@ def test_a_command_whose_streams_are_closed_ends_without_a_traceback() -> None:
     assert done.stderr.count(b"\n") == 1
 
 
-def test_a_command_for_which_there_is_no_memory_says_so_in_a_sentence() -> None:
-    run = "from launch_scripts import typer_commands as all; exit(all.run_command(lambda: bytes(1 << 62)))"
+@pytest.mark.parametrize(
+    "work",
+    [
+        "lambda: bytes(1 << 62)",
+        "lambda: mmap.mmap(-1, 1 << 62)",
+        # A library or a thread which does not fit, as under `ulimit -v`: the room for both is taken away first.
+        "lambda: (resource.setrlimit(resource.RLIMIT_AS, (1, 1)), importlib.import_module('_ctypes'))",
+        "lambda: (resource.setrlimit(resource.RLIMIT_AS, (1, 1)), threading.Thread(target=print).start())",
+    ],
+)
+def test_a_command_for_which_there_is_no_memory_says_so_in_a_sentence(work: str) -> None:
+    loads = "import importlib, mmap, resource, threading; from launch_scripts.typer_commands import run_command"
+    run = f"{loads}; exit(run_command({work}))"
     done = subprocess.run([sys.executable, "-c", run], capture_output=True, text=True)
     assert (done.returncode, done.stdout) == (1, "")
     assert done.stderr == "swarm: there is not enough memory for this (`ulimit -v` may be the limit)\n"

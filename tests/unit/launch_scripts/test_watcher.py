@@ -344,6 +344,22 @@ def printed(status: Status) -> str:
     return text
 
 
+def test_every_view_says_who_stands_by_order_and_what_ends_that() -> None:
+    status = told_by(a0=9)
+    status.latest.heard(fleet(100.0, ("a0-00", 1), ("a0-01", 2)), 0)
+
+    def told(*orders: Order) -> str:
+        status.latest.heard(Orders(role="keeper", id="0", orders=orders), 0)
+        return printed(status)
+
+    freed = Order(subject="vehicle", name="a0-01", stamp_ns=1, off=True)
+    assert "until" not in told(freed)
+    text = told(Order(subject="pause", name="", stamp_ns=1), Order(subject="vehicle", name="a0-00", stamp_ns=1))
+    assert "paused all 2 vehicles and simulated targets, until swarm resume\n" in text
+    assert "stopped 1 vehicle (a0-00), until swarm order vehicle start NAME\n" in text
+    assert "paused" not in told(Order(subject="pause", name="", stamp_ns=2, off=True))
+
+
 def test_each_vehicle_is_shown_with_where_it_is_and_where_it_drives_to_but_those_recalled() -> None:
     status = told_by(a0=9)
     status.latest.heard(fleet(100.0, ("a0-00", 1), ("a0-01", 2)), 0)

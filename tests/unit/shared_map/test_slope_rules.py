@@ -3,7 +3,7 @@ others."""
 
 import math
 from pathlib import Path
-from typing import get_args
+from typing import Any, get_args
 
 import numpy as np
 import pytest
@@ -23,10 +23,9 @@ from shared_map.terrain.slope_and_climb import (
 from shared_map.terrain.synthetic import mountain_noise
 from shared_map.terrain.terrain import build_terrain
 from swarm.config.contradictions import cost_faults
-from swarm.config.ground import CostConfig
+from swarm.config.ground import PRESETS, CostConfig
 from swarm.config.scenario import Strategy
 from swarm.config.scenario_files import load_scenario, parse_scenario
-from swarm.config.vehicle_classes import PRESETS, cost_of_preset
 from swarm.errors import ConfigError
 from swarm.grid import GridSpec
 from swarm.wire.messages.map_data import PACE_LEAST, PACE_MOST
@@ -213,10 +212,10 @@ def test_a_terrain_says_its_rule_and_its_preset() -> None:
 
 
 @pytest.mark.parametrize("name", PRESETS)
-def test_a_preset_is_a_scenario_that_fits_together(name: str) -> None:
-    cost = cost_of_preset(name)
+def test_a_preset_is_a_scenario_that_fits_together(name: Any) -> None:
+    cost = CostConfig(preset=name)
     assert list(cost_faults(cost, "cost")) == []
-    assert parse_scenario(f'cost.preset = "{name}"').cost == cost
+    assert {key: getattr(cost, key) for key in PRESETS[name]} == PRESETS[name]
     assert np.isfinite(slope_factor(np.linspace(0, 0.5, 20).astype(np.float32), cost)).all()
 
 
@@ -226,6 +225,27 @@ def test_settings_of_a_scenario_win_over_those_of_its_preset_key_by_key() -> Non
     ).cost
     assert (cost.slope_rule, cost.max_slope_deg, cost.flat_speed_m_per_s) == ("energy", 35.0, 10.0)
     assert cost.class_factor == {"forest": 1.5, "rock": 4.0, "soil": 1.0, "snow": 1.5}
+
+
+@given(
+    preset=st.sampled_from([None, *PRESETS]),
+    own=st.fixed_dictionaries(
+        {},
+        optional={
+            "slope_rule": st.sampled_from(["linear", "quadratic", "energy", "tobler"]),
+            "flat_speed_m_per_s": st.floats(0.5, 10),
+            "steep_factor": st.floats(1, 9),
+            "max_slope_deg": st.floats(10, 60),
+            "class_factor": st.dictionaries(st.sampled_from(["forest", "rock", "snow"]), st.floats(0.5, 9)),
+        },
+    ),
+)
+@settings(max_examples=few(60))
+def test_a_preset_and_own_settings_mean_the_same_in_python_and_in_a_file(
+    preset: str | None, own: dict[str, Any]
+) -> None:
+    given = own if preset is None else {"preset": preset, **own}
+    assert CostConfig(**given) == parse_scenario("", settings={"cost": given}).cost
 
 
 # --- tables in files --------------------------------------------------------------------------------------------

@@ -360,6 +360,9 @@ def test_a_terrain_with_too_many_cells_names_a_resolution_which_is_allowed(rows:
 HEIGHTS = np.add.outer(np.arange(40) * 2.0, np.arange(40) * 1.0).astype(np.float32)
 
 
+MOON = "+proj=longlat +R=1737400 +no_defs"
+
+
 def slanted(path: Path, heights=HEIGHTS, crs="EPSG:32632", where=(500_000.0, 5_000_000.0)) -> Path:
     return written(path, heights, crs=crs, transform=from_origin(*where, 30, 30))
 
@@ -413,11 +416,17 @@ def test_a_sparse_file_is_read_and_a_cut_one_is_not(tmp_path: Path) -> None:
         load(path)
 
 
-def test_a_sea_floor_is_doubted(tmp_path: Path) -> None:
-    path = str(slanted(tmp_path / "deep.tif", HEIGHTS * 8 - 600))
-    for water_below_m, told in ((None, 1), (0.0, 0)):
-        terrain = build_terrain(Scenario(terrain=TerrainConfig(source=path, water_below_m=water_below_m)))
-        assert sum("a sea floor" in doubt for doubt in doubts_about(facts_of(terrain))) == told
+@pytest.mark.parametrize(
+    ("crs", "water_below_m", "told"),
+    [("EPSG:32632", None, 1), ("EPSG:32632", 0.0, 0), ("EPSG:4326", None, 1), (MOON, None, 0)],
+)
+def test_a_sea_floor_of_the_earth_is_doubted(
+    tmp_path: Path, crs: str, water_below_m: float | None, told: int
+) -> None:
+    place = from_origin(9, 47, 0.001, 0.001) if crs != "EPSG:32632" else from_origin(5e5, 5e6, 30, 30)
+    path = str(written(tmp_path / "deep.tif", HEIGHTS * 8 - 600, crs=crs, transform=place))
+    terrain = build_terrain(Scenario(terrain=TerrainConfig(source=path, water_below_m=water_below_m)))
+    assert sum("no dry land" in doubt for doubt in doubts_about(facts_of(terrain))) == told
 
 
 def test_a_setting_that_contradicts_the_file_is_said_aloud(tmp_path: Path) -> None:

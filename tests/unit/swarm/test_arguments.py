@@ -17,7 +17,6 @@ from shared_map.terrain.terrain import build_terrain
 from swarm.client import Frame
 from swarm.config.ground import CostConfig, TerrainConfig
 from swarm.config.scenario import Scenario
-from swarm.config.vehicle_classes import cost_of_preset
 from swarm.errors import ArgumentError, ConfigError, SwarmError
 from swarm.grid import GridSpec
 
@@ -150,6 +149,6 @@ def test_a_wrong_keyword_is_told_the_nearest() -> None:
             call(**keywords)
         assert str(caught.value) == words
     odd: Any
-    for odd in (5, [], b"hiker"):
+    for odd in (5, [], b"hiker", "hikers"):
         with pytest.raises(ConfigError, match="no preset"):
-            cost_of_preset(odd)
+            CostConfig(preset=odd)
