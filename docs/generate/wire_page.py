@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import enum
 import inspect
 import json
 import re
@@ -45,7 +44,7 @@ def document() -> str:
         "wire", first=first, topics=TOPICS, messages=messages(), enums=(MarkKind, VehicleState, RouteStatus),
         version=WIRE_VERSION, alive_key=ALIVE_KEY, operator=OPERATOR, members=MEMBERS.split(), bus=bus, codec=codec,
         grid=grid, link=_link, granted=_granted, conditions=_conditions, schemas=_schemas, struct=_struct,
-        parts=parts, told=_told(), meant=_meant, alarms=_alarms(),
+        parts=parts, told=_told(), meant=_meant, alarms=alarms.KINDS,
     )  # fmt: skip
 
 
@@ -56,19 +55,10 @@ def _told() -> dict[str, list[str]]:
     return {getattr(topics, name).name: [" ".join(text.split()) for text in texts] for name, *texts in found}
 
 
-def _meant(values: type[enum.Enum]) -> dict[str, str]:
+def _meant(values: type[MarkKind | VehicleState | RouteStatus]) -> dict[str, str]:
     """Name of a value -> what it means, by the docstring below it."""
-    found = re.findall(
-        r'^    (\w+) = [^\n]+\n    """(.+?)\.?"""', inspect.getsource(values), re.DOTALL | re.MULTILINE
-    )
-    return {name: " ".join(text.split()) for name, text in found}
-
-
-def _alarms() -> dict[str, str]:
-    """Kind of an alarm -> when there is one, by the comment beside it."""
-    table = Path(alarms.__file__).with_suffix(".toml").read_text(encoding="utf-8")
-    told = dict(re.findall(r"^\[([\w-]+)\] # (.+)$", table, re.MULTILINE))
-    return {kind: told[kind] for kind in alarms.KINDS}
+    below = re.compile(r'^    (\w+) = [^\n]+\n    """(.+?)\.?"""', re.DOTALL | re.MULTILINE)
+    return {name: " ".join(text.split()) for name, text in below.findall(inspect.getsource(values))}
 
 
 def json_document() -> str:

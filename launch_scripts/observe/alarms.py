@@ -38,6 +38,7 @@ class Kind(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     """One row of `alarms.toml`, which explains the fields."""
 
     label: str
+    meaning: str = ""
     serious: bool = False
     of_many: str = ""
     opened_by: frozenset[str] = frozenset({STATS.name})
