@@ -71,10 +71,6 @@ def factors(value: Mapping[str, float]) -> str:
     return ", ".join(f"{name} x {factor:.2g}" for name, factor in value.items()) or "nothing"
 
 
-def _mean_gap(value: CertifiedGap) -> str:
-    return percent(value.mean)
-
-
 @dataclass(frozen=True, slots=True)
 class Fact:
     """Label and text of a field of a `RunState`, or of a `TargetLine`, of which it is a column.
@@ -132,7 +128,7 @@ class TargetLine:
     following: Annotated[int, Fact("chased by", count)]
     nearest_m: Annotated[float | None, Fact("nearest", distance)]
     captures: Annotated[int, Fact("captures", count)]
-    gap: Annotated[CertifiedGap | None, Fact("certified gap", _mean_gap)]
+    gap: Annotated[CertifiedGap | None, Fact("certified gap", lambda gap: percent(gap.mean))]
     growths: Annotated[int | None, Fact("re-plans", count)]
     growth_ms: Annotated[float | None, Fact("tree", duration)]
     routes_served: Annotated[int | None, Fact("served", count, always=False)]
@@ -217,11 +213,6 @@ class RunState:
     alarms: tuple[Alarm, ...]
     orders: tuple[str, ...]
     goals: tuple[GoalState, ...]
-
-    @property
-    def standing_alarms(self) -> tuple[Alarm, ...]:
-        """Those that last."""
-        return tuple(alarm for alarm in self.alarms if alarm.lasts)
 
 
 def _facts_of(state: type) -> tuple[Fact, ...]:
@@ -360,7 +351,7 @@ def alarm_lines(state: RunState, most: int, *, over: bool = False) -> list[str]:
 
     over  also closed alarms
     """
-    return lines_of(state.alarms if over else state.standing_alarms, most)
+    return lines_of((alarm for alarm in state.alarms if over or alarm.lasts), most)
 
 
 def lines_of(alarms: Iterable[Alarm], most: int) -> list[str]:
