@@ -305,8 +305,7 @@ def ask_learned(bus: Bus, where: object) -> list[MarkSet]:
     replies, failure = replies_to(bus, wire_topics.MARKS, asked, _LEARNED_TIMEOUT_S)
     for word in replies:
         latest.heard(word, 0)
-    found = latest.learned_words()
-    if failure is not None and not found:
+    if not (found := latest.learned_words()) and failure is not None:
         raise BusError(f"no process {where} states what was learned: {failure}")
     return found
 

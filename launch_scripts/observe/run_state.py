@@ -71,6 +71,10 @@ def factors(value: Mapping[str, float]) -> str:
     return ", ".join(f"{name} x {factor:.2g}" for name, factor in value.items()) or "nothing"
 
 
+def _mean_gap(value: CertifiedGap) -> str:
+    return percent(value.mean)
+
+
 @dataclass(frozen=True, slots=True)
 class Fact:
     """Label and text of a field of a `RunState`, or of a `TargetLine`, of which it is a column.
@@ -128,7 +132,7 @@ class TargetLine:
     following: Annotated[int, Fact("chased by", count)]
     nearest_m: Annotated[float | None, Fact("nearest", distance)]
     captures: Annotated[int, Fact("captures", count)]
-    gap: Annotated[CertifiedGap | None, Fact("certified gap", lambda gap: percent(gap.mean))]
+    gap: Annotated[CertifiedGap | None, Fact("certified gap", _mean_gap)]
     growths: Annotated[int | None, Fact("re-plans", count)]
     growth_ms: Annotated[float | None, Fact("tree", duration)]
     routes_served: Annotated[int | None, Fact("served", count, always=False)]
