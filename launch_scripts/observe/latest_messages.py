@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from launch_scripts.observe.summed_counts import Counts, sum_of
+from shared_map.replication.marks import is_tombstone, supersedes
 from shared_map.replication.merge import winners
 from swarm.clock import NS_PER_S
 from swarm.config.scenario import Scenario, agent_of, crew_of
@@ -24,7 +25,7 @@ from swarm.runtime.order_book import OrderBook
 from swarm.runtime.stats import ENDED
 from swarm.runtime.tracker_ownership import Trackings
 from swarm.wire.messages import Message
-from swarm.wire.messages.map_data import MarkKind, MarkSet
+from swarm.wire.messages.map_data import MarkKind, MarkSet, owner_of
 from swarm.wire.messages.orders import GoalState, GoalStates, Orders
 from swarm.wire.messages.planning import PlannerStatus, TargetPose
 from swarm.wire.messages.processes import Heartbeat, RunInfo, Stats
@@ -210,9 +211,13 @@ class LatestState(Counts):
         self._obstacles: dict[str, tuple[Obstacle, int]] = {}
         """Id -> its last report, and the time of its arrival."""
         self._fleets: dict[tuple[str, int], Fleet] = {}
+        """(agent, region) -> its last report, of whichever generation."""
+        self._reports = Newest()
+        """Detection of reports that are newer than the last of an agent's vehicles in a region."""
         self._vehicles: VehicleColumns | None = None
         """The vehicles of `_fleets`, once asked for; None since the last news."""
         self._marks: dict[tuple[str, int], MarkSet] = {}
+        """(author, tile) -> its set, until a keeper says that nothing of it is left."""
         self._ranks: dict[tuple[str, str], int] = {}
         """(role, job) -> rank of the process that leads, where there are standbys."""
         self._beats = Newest(silence_ns=FOR_GOOD_NS)
@@ -221,7 +226,8 @@ class LatestState(Counts):
         """(role, id) -> incarnations whose token is up; empty for a process that was alive, of those that published
         counts or that the observer started."""
         self._started: dict[tuple[str, str], set[int]] = {}
-        """(role, id) -> incarnations of the processes that the observer itself has started."""
+        """(role, id) -> incarnations of the processes that the observer itself has started: the newest, and those
+        whose token was still up then."""
         self._told_ns: dict[tuple[str, str], int] = {}
         """(role, id) -> time of the process's last counts, or of its first token."""
         self._fleet_told_ns: dict[str, int] = {}
@@ -246,9 +252,9 @@ class LatestState(Counts):
                     _remember(self._ranks, (role, job), rank)
             case Fleet():
                 self.moved_ns = self.fleet_ns = max(self.moved_ns, now_ns)
-                fleet = self._fleets.get((message.author, message.region))
-                if fleet is None or message.seq >= fleet.seq:
-                    _remember(self._fleets, (message.author, message.region), message)
+                at = (owner_of(message.author), message.region)
+                if self._reports.is_news(at, (message.stamp_ns, message.seq), now_ns):
+                    _remember(self._fleets, at, message)
                     self._vehicles = None
                 if message.ids:
                     _remember(self._fleet_told_ns, agent_of(message.ids[0]), now_ns)
@@ -258,9 +264,12 @@ class LatestState(Counts):
                 self.moved_ns = max(self.moved_ns, now_ns)
                 return self._trackings.counted(message, now_ns)
             case MarkSet():
-                marks = self._marks.get((message.author, message.tile))
-                if marks is None or (message.epoch, message.seq) > (marks.epoch, marks.seq):
-                    _remember(self._marks, (message.author, message.tile), message, _MOST_SETS)
+                of = (message.author, message.tile)
+                marks = self._marks.get(of)
+                if marks is None or supersedes(message, marks):
+                    _remember(self._marks, of, message, _MOST_SETS)
+                    if is_tombstone(message):
+                        self._marks.pop(of, None)
             case GoalStates(states=states):
                 for each in states:
                     _remember(self._goals, each.name, each)
@@ -271,7 +280,8 @@ class LatestState(Counts):
     def started(self, peer: Peer) -> None:
         """Notes a generation that the observer itself has started. A token under the same name that is none of
         these is of another run, as at the port that all have by default."""
-        self._started.setdefault((peer.role, peer.id), set()).add(peer.incarnation)
+        key = (peer.role, peer.id)
+        self._started[key] = {peer.incarnation, *self._alive.get(key, ())}
 
     def alive(self, peer: Peer, up: bool, now_ns: int) -> None:
         """Notes that a liveliness token appeared (`up`) or ended."""

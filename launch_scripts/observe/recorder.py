@@ -257,15 +257,17 @@ _NO_GAP: dict[str, Any] = {"routes_begun": 0, "certified_gap": None}
 # --- the recorder -------------------------------------------------------------------------------------------------
 
 _SAMPLE_NS = NS_PER_S
-_MOST_SAMPLES = 1024
-"""Samples that are kept of a run, however long it is (`Thinned`). Chosen, not measured."""
+_MOST_SAMPLES = 512
+"""Samples that are kept of a run, however long it is (`Thinned`): until they are thinned for the first
+time, memory grows."""
 _POINTS = 120
 """Instants in a report: a plot of it is some 300 pixels wide."""
 _TRACK_NS = int(TRACK_S * NS_PER_S)
 _MOST_PLACES = 400_000
 """Sampled places that are kept at most, of vehicles and of targets each."""
-_OF_SAMPLING = 40
-"""A sampling itself takes as much memory as 40 places: few targets would fill it for half a day."""
+_OF_SAMPLING = 400
+"""A sampling counts as 400 places more, so a thousand are kept at most: else the places of few vehicles or targets
+fill the memory for hours. Its objects take as much as 40 places."""
 _NOTES_KEPT = 1000
 """The newest ones. Chosen, not measured."""
 _ROUTE_BYTES = 4_000_000

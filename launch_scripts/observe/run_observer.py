@@ -15,7 +15,6 @@ from contextlib import suppress
 from typing import Protocol
 
 from launch_scripts.observe.latest_messages import LatestState, plan_of_members, run_of_most
-from shared_map.replication.marks import supersedes
 from shared_map.replication.tiles import beyond_tile
 from shared_map.terrain.map_frame import MapFrame
 from swarm.bus.bus import Appeared, AskEnded, Bus, Disappeared, Event, Heard, Post, Replied
@@ -301,17 +300,14 @@ def ask_learned(bus: Bus, where: object) -> list[MarkSet]:
 
     where  names the swarm in errors
     """
-    beyond = beyond_tile(frame_of_run(bus, where).grid)
-    replies, failure = replies_to(bus, wire_topics.MARKS, MarksRequest(tiles=[beyond]), _LEARNED_TIMEOUT_S)
-    found: dict[str, MarkSet] = {}
+    latest = LatestState(plan_of_members(()), frame_of_run(bus, where).grid)
+    asked = MarksRequest(tiles=[beyond_tile(latest.grid)])
+    replies, failure = replies_to(bus, wire_topics.MARKS, asked, _LEARNED_TIMEOUT_S)
     for word in replies:
-        if isinstance(word, MarkSet) and word.tile == beyond:
-            held = found.get(word.author)
-            if held is None or supersedes(word, held):
-                found[word.author] = word
-    if failure is not None and not found:
+        latest.heard(word, 0)
+    if not (found := latest.learned_words()) and failure is not None:
         raise BusError(f"no process {where} states what was learned: {failure}")
-    return [found[author] for author in sorted(found)]
+    return found
 
 
 def frame_of_members(members: Sequence[RunInfo]) -> MapFrame | None:

@@ -222,11 +222,6 @@ class RunState:
     orders: tuple[str, ...]
     goals: tuple[GoalState, ...]
 
-    @property
-    def standing_alarms(self) -> tuple[Alarm, ...]:
-        """Those that last."""
-        return tuple(alarm for alarm in self.alarms if alarm.lasts)
-
 
 def _facts_of(state: type) -> tuple[Fact, ...]:
     """The facts among the fields of a state, in their order."""
@@ -367,7 +362,7 @@ def alarm_lines(state: RunState, most: int, *, over: bool = False) -> list[str]:
 
     over  also closed alarms
     """
-    return lines_of(state.alarms if over else state.standing_alarms, most)
+    return lines_of((alarm for alarm in state.alarms if over or alarm.lasts), most)
 
 
 def lines_of(alarms: Iterable[Alarm], most: int) -> list[str]:

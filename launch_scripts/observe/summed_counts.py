@@ -12,6 +12,8 @@ from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from typing import TypeVar
 
+from msgspec.structs import replace
+
 from swarm.clock import NS_PER_S
 from swarm.peers import job_of
 from swarm.runtime import stats as counters
@@ -70,7 +72,8 @@ class Counts:
         self._newest: dict[tuple[str, str], Stats] = {}
         """(role, id) -> of its newest incarnation."""
         self._before: dict[tuple[str, str], Stats] = {}
-        """(role, id) -> of the same incarnation, at least `_LEAST_NS` earlier."""
+        """(role, id) -> of the same incarnation, at least `_LEAST_NS` earlier; without what no rate is
+        made of, which takes most of the memory."""
         self.silences: dict[tuple[str, str], tuple[int, int]] = {}
         """(role, id) -> begin and end of the longest time without counts in one generation, if that was long."""
 
@@ -94,7 +97,7 @@ class Counts:
         if newest is stats and known is None:
             self._before.pop(of, None)
         elif newest is stats and known is not None and stats.stamp_ns - known.stamp_ns >= _LEAST_NS:
-            self._before[of] = known
+            self._before[of] = replace(known, histograms={}, counts_by={}, histograms_by={})
         began_ns, end_ns = self.silences.get(of, (0, LONG_SILENCE_NS))
         if known is not None and stats.stamp_ns - known.stamp_ns > end_ns - began_ns:
             self.silences[of] = (known.stamp_ns, stats.stamp_ns)

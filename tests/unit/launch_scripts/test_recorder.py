@@ -160,8 +160,13 @@ def test_an_hour_of_kills_leaves_as_much_in_memory_as_a_minute_of_them_and_no_co
         ]
         for n, generation in zip(range(from_s, until_s), generations, strict=True):
             late = random.Random(n).choice(generations[: n - from_s + 1])
-            for message in (generation, late, fleet("a0.1", {"a0-00": (n, 1.0)}, n)):
+            author, gone = f"a0.{n:x}", set_of(f"a0.{n - 1:x}", 1, 1, {})
+            marks = [set_of(author, 1, 1, {3: (MarkKind.LETHAL, 0.0, n)})]
+            marks.append(msgspec.structs.replace(gone, seq=gone.seq + 1))  # a keeper has compacted it
+            for message in (generation, late, fleet(author, {"a0-00": (n, 1.0)}, n, region=n % 2), *marks):
                 latest.heard(message, n * NS_PER_S)
+            assert latest.vehicles().east_m.tolist() == [n]
+            latest.started(Peer("agent", "a0", n))
             latest.alive(Peer("agent", "a0", n), True, n * NS_PER_S)
             latest.alive(Peer("agent", "a0", n - 1), False, n * NS_PER_S)
         assert latest.total("marks") == until_s - 1
@@ -400,7 +405,7 @@ def test_a_run_of_a_day_takes_no_more_memory_than_one_of_an_hour(monkeypatch: py
     """The size of a recorder by its own lists: captures, samples and places are all bounded."""
     monkeypatch.setattr("launch_scripts.observe.recorder._CAPTURES_KEPT", 128)
     monkeypatch.setattr("launch_scripts.observe.recorder._MOST_SAMPLES", 128)
-    monkeypatch.setattr("launch_scripts.observe.recorder._MOST_PLACES", 500)
+    monkeypatch.setattr("launch_scripts.observe.recorder._MOST_PLACES", 5_000)
     recorder = Recorder(scenario(), GRID)
 
     def record(from_s: int, until_s: int) -> int:
