@@ -315,7 +315,7 @@ class TargetTree:
     def may_reach(self, cells: Any, costs_s: Floats) -> bool:
         """Returns True if a growth that has stopped may still find a way for one of the cells without a cost."""
         unknown = _in_a_row(cells)[np.isinf(costs_s)]
-        return not self._is_whole and self._open(unknown).size > 0
+        return not self._is_whole and self._look(unknown)[0].size > 0
 
     # --- how ----------------------------------------------------------------------------------------------------
 
@@ -507,7 +507,8 @@ class TargetTree:
 
         rest  the worker is to grow the whole tree
         """
-        root, askers = self.cost_grid.pad(target_cell), self._passable(self._askers.cells)
+        root, askers = self.cost_grid.pad(target_cell), self._askers.cells
+        askers = askers[self.cost_grid.cell_cost[askers] < np.inf]
         aim = self._growth.aim_at(askers, root, self._tree.parent)
         self._growth.begin(root)
         grown = self._growth.go_on(askers, self.times.most_cells, aim)
@@ -530,7 +531,7 @@ class TargetTree:
         if not self.ready or self._is_whole:
             return self.ready
         self._reach(cells)
-        return self._is_whole or not self._without_path(self._open(cells)).size
+        return self._is_whole or not self._without_path(self._look(cells)[0]).size
 
     def _reach(self, cells: Any) -> None:
         """Continues a stopped growth up to these cells."""
@@ -575,10 +576,6 @@ class TargetTree:
         """Those of some padded cells from which the tree leads nowhere, or not yet."""
         return starts[~self._leads(starts)]
 
-    def _open(self, cells: Any) -> NDArray[np.int64]:
-        """Those of some numbers that are passable cells of the grid, padded."""
-        return self._look(cells)[0]
-
     def _look(self, cells: Any) -> tuple[NDArray[np.int64], int, int]:
         """Returns those of some numbers that are passable cells of the grid, padded; how many of them a growth that
         has stopped did not reach; and how many rows or columns the farthest is away from the root."""
@@ -588,16 +585,13 @@ class TargetTree:
         count, unknown, half = open_cells(*found)
         return starts[:count], unknown, half
 
-    def _passable(self, starts: NDArray[np.int64]) -> NDArray[np.int64]:
-        return starts[self.cost_grid.cell_cost[starts] < np.inf]
-
     def _force_near(self, wanted: NDArray[np.int64]) -> Update | None:
         """Makes the tree exact as far as these cells are; None if that takes too long here."""
         tree, growth = self._tree, self._growth
         if not (isinstance(tree, CostToGoTree) and self._can_stop and tree.precise and self._all_kernels()):
             return None
         growth.begin(self.cost_grid.pad(tree.root))
-        starts = self._open(wanted)
+        starts = self._look(wanted)[0]
         grown = growth.go_on(starts, self.times.most_cells)
         if grown < 0 or (growth.bound < np.inf and not (growth.cost[starts] < np.inf).all()):
             return None

@@ -198,16 +198,15 @@ class Agent:
 
     def _send(self, vehicle: Vehicle, now_ns: int) -> None:
         cell = self.goals.cell(vehicle.id)
-        name = None if cell is None else goal_name(cell)
-        if name == vehicle.target or (name is None and vehicle.goal is None):
+        if cell == vehicle.goal:
             return
         vehicle.release()
         self.goals.refused.pop(vehicle.id, None)
         self._driver.stop_soon(vehicle)
-        if name is None:
+        if cell is None:
             self.assignment.ask_soon(now_ns)
             return
-        vehicle.assign(name, now_ns)
+        vehicle.assign(goal_name(cell), now_ns)
         if PLACES not in self._planners:
             vehicle.lose_planner(now_ns)
 
@@ -375,7 +374,7 @@ class Agent:
                 vehicle.set_tracked(not vehicle.tracked)
             self._check_reach(vehicle)
             if vehicle.in_reach and vehicle.goal is not None and vehicle.motion.at_rest:
-                self.goals.reached(vehicle.id, vehicle.cell, now_ns)
+                self.goals.reached(vehicle.id, vehicle.goal, now_ns)
             stopped = self.stopped(vehicle.id)
             if stopped:
                 self._driver.stop_soon(vehicle)
@@ -429,10 +428,10 @@ class Agent:
         pose = self._poses.get(target)
         return None if pose is None else pose.cell
 
-    def _in_reach(self, target: str | None, cell: int) -> bool:
-        if (goal := goal_of(target)) is not None:
-            return self.goals.is_at(goal, cell)
-        pose = self._poses.get(target)
+    def _in_reach(self, vehicle: Vehicle, cell: int) -> bool:
+        if vehicle.goal is not None:
+            return self.goals.is_at(vehicle.id, vehicle.goal, cell)
+        pose = self._poses.get(vehicle.target)
         if pose is None:
             return False
         cols, resolution_m = self._map.grid.cols, self._map.grid.resolution_m
@@ -442,7 +441,7 @@ class Agent:
         return math.hypot(south, cell % cols - pose.cell % cols) * resolution_m <= range_m
 
     def _check_reach(self, vehicle: Vehicle) -> None:
-        near = self._in_reach(vehicle.target, vehicle.cell)
+        near = self._in_reach(vehicle, vehicle.cell)
         if near != vehicle.in_reach:
             vehicle.set_in_reach(near)
             if near:

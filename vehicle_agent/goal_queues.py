@@ -41,8 +41,9 @@ def next_cell(goals: VehicleGoals | None) -> int | None:
 
 
 def is_over(goals: VehicleGoals) -> bool:
-    """Returns True if a vehicle has reached its last place."""
-    return not goals.off and goals.then != "repeat" and goals.done >= len(goals.cells)
+    """Returns True if a vehicle has reached its last place. A loop of one place ends there."""
+    ends = goals.then != "repeat" or len(set(goals.cells)) == 1
+    return not goals.off and ends and goals.done >= len(goals.cells)
 
 
 def arrival_cells(goal: int, vehicles: int, steps: Callable[[int], Iterable[int]]) -> frozenset[int]:
@@ -73,8 +74,6 @@ class GoalQueues:
         self.shared: Mapping[int, int] = {}
         self.refused: dict[str, str] = {}
         self._steps = steps
-        self._arrived: dict[str, int] = {}
-        """Vehicle -> the cell on which it has reached a place last."""
         self._arrivals: dict[int, frozenset[int]] = {}
 
     def look_again(self) -> None:
@@ -85,22 +84,27 @@ class GoalQueues:
         """The place to which a vehicle goes or which it holds; None if it chases targets."""
         return next_cell(self.book.get(vehicle))
 
-    def is_at(self, goal: int, cell: int) -> bool:
-        """Returns True if a vehicle that rests on a cell has reached a place."""
-        if goal not in self.shared:
-            return goal == cell
-        if goal not in self._arrivals:
-            vehicles = min(self.shared[goal], MOST_SENT)  # whatever is told, the work is bounded
-            self._arrivals[goal] = arrival_cells(goal, vehicles, self._steps)
-        return cell in self._arrivals[goal]
+    def is_at(self, vehicle: str, goal: int, cell: int) -> bool:
+        """Returns True if a vehicle that rests on a cell has reached a place. On a loop, a cell that counts for the
+        place before does not count for this one, too: the vehicle would not move any more."""
+        goals, before = self.book.in_force(vehicle), goal
+        if goals is not None and goals.then == "repeat":
+            before = goals.cells[goals.done % len(goals.cells) - 1]
+        return cell == goal or (cell in self._near(goal) and (before == goal or cell not in self._near(before)))
 
-    def reached(self, vehicle: str, cell: int, now_ns: int) -> bool:
-        """A vehicle is at rest at its place. Returns True if that is new: a vehicle on a loop must move first, as
-        one cell may count for two places."""
+    def _near(self, goal: int) -> frozenset[int]:
+        """The cells on which a vehicle reaches a place."""
+        if goal not in self._arrivals:
+            vehicles = min(self.shared.get(goal, 1), MOST_SENT)  # whatever is told, the work is bounded
+            self._arrivals[goal] = arrival_cells(goal, vehicles, self._steps)
+        return self._arrivals[goal]
+
+    def reached(self, vehicle: str, goal: int, now_ns: int) -> bool:
+        """A vehicle is at rest at the place for which it goes. Returns True if that is news: not if it has no place
+        left, or is sent to another by now."""
         goals = self.book.in_force(vehicle)
-        if goals is None or is_over(goals) or (goals.then == "repeat" and self._arrived.get(vehicle) == cell):
+        if goals is None or is_over(goals) or goal != next_cell(goals):
             return False
-        self._arrived[vehicle] = cell
         return bool(self.book.merge([replace(goals, done=goals.done + 1)], now_ns))
 
     def states(

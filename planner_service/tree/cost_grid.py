@@ -19,6 +19,7 @@ from planner_service.tree.queue_choice import grow_tree
 from shared_map.array_files import Bools, Floats, private_copy
 from shared_map.terrain.slope_and_climb import Climb
 from swarm.config.scenario import PlannerConfig
+from swarm.errors import ArgumentError
 from swarm.grid import GridSpec, Window
 
 
@@ -105,10 +106,12 @@ class CostGrid:
             self.metres *= climb.lowest
         self.length_weight_s = min(config.length_weight * grid.resolution_m, float(kernels.DEAREST_S))
         """s; what a cell's length costs beside the time. It is part of every cell cost."""
-        if not (_SHORTEST_M <= self.metres <= _LONGEST_M and self.length_weight_s >= 0):
-            raise ValueError(
+        # With climbs, a step's factor would hold for the price of its length, too.
+        most = 0 if climb else np.inf
+        if not (_SHORTEST_M <= self.metres <= _LONGEST_M and 0 <= config.length_weight <= most):
+            raise ArgumentError(
                 f"resolution_m is {grid.resolution_m:g}, planner.length_weight {config.length_weight:g}; expected"
-                f" {_SHORTEST_M:g} to {_LONGEST_M:g} and 0 or more"
+                f" {_SHORTEST_M:g} to {_LONGEST_M:g} and 0 or more, with climbs 0"
             )
         self.cell_cost: Floats = NO_COSTS
         """float32 (size,), s: price of a straight step into each cell; inf is lethal, as is the border. Empty

@@ -158,7 +158,7 @@ class PartialGrowth:
 
         aim  which cells are left out. After a growth that left out some, one that goes on begins again
         """
-        if self._state[4] and self.touched > 1:
+        if self._state[4]:
             self.begin(self.root)
         assert self._scratch is not None
         before, buckets = self.touched, (self._width, self._circle)

@@ -31,7 +31,7 @@ from swarm.grid import STEP_COL, STEP_ROW
 from swarm.wire.fields import CODES, OR_INFINITE, Column, Directions, name_of, np, numpy_loaded, taken_apart
 from swarm.wire.messages import Message
 from swarm.wire.messages.map_data import MarkSet, faulty_sets
-from swarm.wire.messages.planning import RouteReply
+from swarm.wire.messages.planning import PlaceRouteReply, RouteReply
 from swarm.wire.route_columns import Route
 from swarm.wire.versions import STEPS, as_read, as_written, read_schemas, schema_of_type
 
@@ -300,15 +300,14 @@ def packed_json(
 
 
 def encode_json(message: Message, key: str = "") -> bytes:
-    """A message as JSON for people. Routes are listed one by one, with the cells that they pass.
+    """A message as JSON for people. Routes are listed one by one, with the cells that they pass if it tells the
+    grid.
 
     key  for which it is meant, below the namespace
     """
     fields = _plain(message)
-    if isinstance(message, RouteReply):
-        fields["routes"] = [
-            {**_plain(each), "cells_row_col": _cells_row_col(each, message.cols)} for each in message.routes
-        ]
+    if isinstance(message, RouteReply | PlaceRouteReply):
+        fields["routes"] = [_plain(each) | _cells_row_col(each, message) for each in message.routes]
     meant = {KEY_FIELD: key} if key else {}
     return msgspec.json.encode({"schema": schema_of_type(type(message))} | fields | meant)
 
@@ -426,10 +425,12 @@ def _quoted(given: Any) -> str:
     return text if len(text) <= _QUOTED else text[:_QUOTED] + " ..."
 
 
-def _cells_row_col(route: Route, cols: int) -> list[list[int]]:
-    row, col = divmod(route.start, cols)
+def _cells_row_col(route: Route, reply: RouteReply | PlaceRouteReply) -> dict[str, list[list[int]]]:
+    if isinstance(reply, PlaceRouteReply):
+        return {}
+    row, col = divmod(route.start, reply.cols)
     cells = [[row, col]]
     for code in route.directions:
         row, col = row + STEP_ROW[code], col + STEP_COL[code]
         cells.append([row, col])
-    return cells
+    return {"cells_row_col": cells}

@@ -19,13 +19,17 @@ from support.fields import make_field, paces_of_any_ratio
 from support.kernel_oracle import grown, inner, loaded
 from support.planner_strategies import RULES, STRATEGIES, open_cell, random_climb, random_pace
 
+from planner_service import RouteFinder
 from planner_service.kernels.cell_costs import CHEAPEST_S, DEAREST_S
 from planner_service.kernels.layout import NONE
 from planner_service.kernels.queue_directed import grow_directed_by_buckets, make_scratch
 from planner_service.target_tree import TargetTree
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
+from shared_map.terrain.slope_and_climb import climb_of
+from swarm.config.ground import CostConfig
 from swarm.config.scenario import PlannerConfig
+from swarm.errors import ConfigError
 from swarm.grid import STEP_COL, STEP_ROW, GridSpec, Window
 
 EXAMPLES = few(60)
@@ -173,6 +177,13 @@ def test_shared_cell_costs_that_no_map_has_are_refused(bad: float) -> None:
 def test_lengths_that_no_map_has_are_refused(metres: float, weight: float) -> None:
     with pytest.raises(ValueError, match=r"length_weight|resolution_m"):
         CostGrid(GridSpec(2, 2, metres), PlannerConfig(length_weight=weight))
+
+
+def test_a_price_of_length_does_not_go_with_climbs() -> None:
+    grid = GridSpec(4, 4, 10.0)
+    climb = climb_of(grid, np.eye(4, dtype=np.float32), CostConfig(directional=True, slope_rule="tobler"))
+    with pytest.raises(ConfigError, match=r"length_weight 0.1; expected .* with climbs 0"):
+        RouteFinder(np.ones((4, 4)), resolution_m=10.0, climb=climb, length_weight=0.1)
 
 
 # --- uphill differs from downhill -----------------------------------------------------------------------------

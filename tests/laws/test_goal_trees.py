@@ -80,7 +80,22 @@ def test_a_growth_that_stops_is_exact_where_it_was_and_bounds_the_rest(rules: di
         everywhere = np.flatnonzero(np.isfinite(ground.cell_cost))
         growth.go_on(everywhere, 1 << 40)
         np.testing.assert_allclose(costs_of(growth, pace), best, rtol=ROUNDING)
+        if np.isinf(best[np.isfinite(pace.reshape(-1))]).any():
+            assert growth.bound == np.inf, "whoever has no path is to hear so, not to wait"
     assert aimed > 20
+
+
+@pytest.mark.parametrize("strategy", ["full", "auto"])
+def test_who_is_shut_off_from_the_target_is_told_so_at_the_first_ask(strategy: Strategy) -> None:
+    for room in (1, 2, 30):
+        pace = np.full((3, 40), np.inf, np.float32)
+        pace[1, :room] = 1.0
+        tree = TargetTree(GridSpec(*pace.shape, 1.0), PlannerConfig(strategy=strategy))
+        tree.update(pace, 40, [], 0)
+        assert tree.routes([40]).statuses[0] == 0
+        pace[1, 35] = 1.0
+        tree.update(pace, 40, [Window(1, 35, 2, 36)], 1)
+        assert tree.routes([75])[0].status is RouteStatus.UNREACHABLE
 
 
 def test_a_growth_aims_at_what_the_route_to_the_last_root_costs_to_the_new_one() -> None:

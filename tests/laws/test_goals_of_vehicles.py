@@ -1,6 +1,7 @@
 """Goals of vehicles: every place is reached in its order and none is skipped, whatever is lost, repeated or
 restarted; vehicles which share a place have room around it."""
 
+import math
 import random
 from collections.abc import Callable
 
@@ -101,6 +102,34 @@ def test_places_are_reached_in_order_and_the_last_order_counts_whatever_is_lost_
         assert held.done <= len(visited)
 
 
+@pytest.mark.parametrize("seed", range(few(200)))
+def test_a_vehicle_on_a_loop_goes_on_for_ever_and_counts_no_cell_for_places_without_end(seed: int) -> None:
+    chance, grid = random.Random(seed), GridSpec(5, 5, 1.0)
+    queues = GoalQueues(lambda cell: [each for _, each in grid.neighbours(cell)])
+    cells = [chance.randrange(grid.cells) for _ in range(chance.randrange(1, 5))]
+    queues.shared = {cell: chance.randrange(2, 8) for cell in cells if chance.random() < 0.5}
+    here = chance.choice([cells[0], chance.randrange(grid.cells)])
+    queues.book.merge([VehicleGoals(name="a0-00", stamp_ns=1, cells=cells, then="repeat")], 1)
+    rests = 0
+    for _ in range(60):
+        goal = queues.cell("a0-00")
+        assert goal is not None
+        if queues.is_at("a0-00", goal, here):
+            rests += 1
+            counts = queues.reached("a0-00", goal, 2)
+            assert counts or len(set(cells)) == 1, "a vehicle that has arrived does not move: it waits for ever"
+            assert rests <= len(cells) or len(set(cells)) == 1
+        else:
+            rests = 0
+            to = grid.row_col(goal)
+            here = min(
+                (each for _, each in grid.neighbours(here)), key=lambda cell: math.dist(grid.row_col(cell), to)
+            )
+    goals = queues.book.get("a0-00")
+    assert goals is not None
+    assert goals.done == 1 if len(set(cells)) == 1 else goals.done > len(cells)
+
+
 @given(
     st.lists(st.integers(0, 99), min_size=1, max_size=5), st.sampled_from(THEN), st.integers(0, 12), st.booleans()
 )
@@ -120,7 +149,7 @@ def test_a_vehicle_goes_to_each_place_and_then_holds_chases_or_begins_again(
         assert not is_over(goals)
     else:
         assert goes_to == {"hold": cells[-1], "chase": None, "repeat": cells[done % len(cells)]}[then]
-        assert is_over(goals) == (then != "repeat")
+        assert is_over(goals) == (then != "repeat" or len(set(cells)) == 1)
 
 
 @given(st.sets(st.integers(0, GRID.cells - 1), max_size=90), st.integers(0, GRID.cells - 1), st.integers(1, 60))

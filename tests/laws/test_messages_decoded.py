@@ -24,7 +24,15 @@ from swarm.wire.codec import MAX_ITEMS, MAX_PAYLOAD_BYTES, decode, decode_parame
 from swarm.wire.fields import Column, pack_column, taken_apart
 from swarm.wire.messages import Message, Nothing, schema_of
 from swarm.wire.messages.map_data import MarkSet
-from swarm.wire.messages.planning import CostReply, CostRequest, PushedRoute, RouteReply, RouteRequest, TargetPose
+from swarm.wire.messages.planning import (
+    CostReply,
+    CostRequest,
+    PlaceRouteReply,
+    PushedRoute,
+    RouteReply,
+    RouteRequest,
+    TargetPose,
+)
 from swarm.wire.messages.processes import Note, Stats
 from swarm.wire.messages.traffic import HostState, Table
 from swarm.wire.route_columns import Route, Routes, RouteStatus
@@ -277,6 +285,9 @@ def test_a_route_reply_is_readable_as_json():
     assert found["cells_row_col"] == [[1, 1], [1, 2], [2, 3]]
     assert none["status"] == "unreachable"
     assert none["cost_s"] is None
+    to_place = msgspec.structs.replace(BY_TYPE[PlaceRouteReply], routes=BY_TYPE[RouteReply].routes)
+    del found["cells_row_col"], none["cells_row_col"]
+    assert json.loads(encode_json(to_place))["routes"] == [found, none]
 
 
 def test_every_message_is_readable_as_json():

@@ -43,6 +43,9 @@ caught = "stay"
 
 [[groups]]
 vehicles = 1
+
+[planner]
+places = true
 """
 
 
@@ -100,14 +103,17 @@ def test_a_vehicle_of_mavlink_alone_is_avoided_and_gone_when_its_adapter_dies(pa
         eventually(lambda: "rover" not in watching.vehicles, 5, "the end of the lease")
 
 
-def test_without_arm_a_mission_is_uploaded_and_the_vehicle_stays_where_it_is(pair: Pair, swarm: Swarm) -> None:
+@pytest.mark.parametrize(("option", "named", "goal"), [("--target", "t", TARGET), ("--to", "cell:50,60", (50, 60))])
+def test_without_arm_a_mission_is_uploaded_and_the_vehicle_stays_where_it_is(
+    pair: Pair, swarm: Swarm, option: str, named: str, goal: tuple[int, int]
+) -> None:
     vehicle = pair.vehicle()
-    pair.adapter("--target", "t")
+    pair.adapter(option, named)
     vehicle.wait_for(r"^mission \d+ ")
     found = re.search(r"^mission (\d+) (\S+) (\S+)", vehicle.text, re.MULTILINE)
     end = swarm.frame.cell(*swarm.frame.from_wgs84(float(found[2]), float(found[3])))
     row, col = swarm.frame.grid.row_col(end)
-    assert max(abs(row - TARGET[0]), abs(col - TARGET[1])) <= 1, "its last item is the target's cell"
+    assert max(abs(row - goal[0]), abs(col - goal[1])) <= 1, "its last item is the cell of the target or place"
     assert int(found[1]) < 40, "turns, not cells"
     vehicle.wait_for(r"(?s)mission.*^at .*^at .*^at ")
     assert "armed" not in vehicle.text

@@ -124,7 +124,7 @@ class Steering:
         pushed_ms: int,
         age_ms: int,
         held: Container[int],
-        in_reach: Callable[[str | None, int], bool],
+        in_reach: Callable[[Vehicle, int], bool],
         lot: int,
     ) -> CellRequest:
         """Returns the request for a vehicle that holds these cells. Depends on nothing but its arguments, on ground
@@ -133,7 +133,7 @@ class Steering:
         pushed_ms  the age with which it is to make way into another shard; 0 if it is not
         age_ms     for how long it has been on its way
         held       the cells that vehicles hold
-        in_reach   whether a target is within capture range of a cell
+        in_reach   whether the target of a vehicle is within its reach from a cell
         lot        decides between cells that are as good as each other, for one that stands
         """
         here, still = path[0], len(path) == 1
@@ -151,7 +151,7 @@ class Steering:
                 key=lambda cell: (
                     self.obstacles.danger(cell) if flees else 0.0,
                     self._is_one_way(here, cell),
-                    not in_reach(vehicle.target, cell),
+                    not in_reach(vehicle, cell),
                     cell in held,
                     hash((lot, cell)),
                 ),
@@ -296,7 +296,7 @@ class CellRequests:
 
     near_cells   how far from a vehicle the ground may lie on which its request depends
     target_cell  the cell of a target, None where it is unknown
-    in_reach     whether a target is within capture range of a cell
+    in_reach     whether the target of a vehicle is within its reach from a cell
     seed         decides ties
 
     of  vehicle -> its request, as of the last call of `make` or `stay`; the same object while it says the same
@@ -306,7 +306,7 @@ class CellRequests:
     holdings: Holdings
     near_cells: int
     target_cell: Callable[[str | None], int | None]
-    in_reach: Callable[[str | None, int], bool]
+    in_reach: Callable[[Vehicle, int], bool]
     seed: str
     of: dict[str, CellRequest] = field(default_factory=dict)
     _made_of: dict[str, tuple[tuple[object, ...], int, int]] = field(default_factory=dict)

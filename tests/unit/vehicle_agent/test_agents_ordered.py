@@ -1,9 +1,11 @@
 """Agents end to end on a simulated network, with a keeper: vehicles that operators send to places; zones, which a
 vehicle inside leaves and no other enters."""
 
+import random
 from collections import Counter
 from typing import Any
 
+import pytest
 from msgspec.structs import replace
 from support.agent_world import OPEN, AgentWorld, pace_of, scenario
 from support.bus_world import answer_of
@@ -13,7 +15,7 @@ from planner_service.places_service import PlacesService
 from shared_map.keeper.mark_store import KeeperStore
 from swarm.bus.bus import Event
 from swarm.wire.messages import Message
-from swarm.wire.messages.orders import GiveOrder, GoalState, SendVehicle, ZoneOrder
+from swarm.wire.messages.orders import GiveOrder, GoalState, SendVehicle, Then, ZoneOrder
 from swarm.wire.messages.vehicles import Obstacle, VehicleState
 from swarm.wire.topics import GIVE_ORDER, GOAL_STATES, OBSTACLE, SEND_VEHICLE, ZONES, Topic
 
@@ -52,8 +54,9 @@ class SentWorld(KeptWorld):
     def _told(self, event: Event) -> None:
         self.progress.update({each.name: each for each in event.message.states})
 
-    def send(self, vehicle: str, place: tuple[int, int]) -> None:
-        self.ask(SEND_VEHICLE, SendVehicle(vehicle=vehicle, places=["cell:{},{}".format(*place)]))
+    def send(self, vehicle: str, *places: tuple[int, int], then: Then = "hold") -> None:
+        named = ["cell:{},{}".format(*place) for place in places]
+        self.ask(SEND_VEHICLE, SendVehicle(vehicle=vehicle, places=named, then=then))
 
     def states_of_goals(self) -> Counter[str]:
         return Counter(each.state for each in self.progress.values())
@@ -108,6 +111,32 @@ def test_a_better_way_that_opens_is_taken_on_the_way() -> None:
     assert (10, 5) in crossed
     routes = [each for each in world.followed[begun:] if each.vehicle == "a0-00"]
     assert len(routes) <= 3, "a route that is the rest of the one before is not begun anew"
+
+
+@pytest.mark.parametrize("then", ["hold", "repeat"])
+def test_no_place_counts_as_reached_before_the_vehicle_is_there(then: Then) -> None:
+    starts = [(3 * n + 1, 5) for n in range(6)]
+    # So slow a tick that agents act on messages between two.
+    world = SentWorld(scenario(6, starts).replace("seed = 3", "seed = 3\ntime_scale = 8"), OPEN)
+    chance, grid = random.Random(4), world.terrain.grid
+    done: dict[tuple[str, int], int] = {}
+    reached: list[tuple[int, int]] = []
+
+    def look() -> None:
+        for goals in (each for service in world.agents.values() for each in service.agent.goals.book):
+            for n in range(done.get((goals.name, goals.stamp_ns), 0), goals.done):
+                reached.append((goals.cells[n % len(goals.cells)], grid.cell(*world.where()[goals.name])))
+            done[goals.name, goals.stamp_ns] = goals.done
+
+    world.after_tick.append(look)
+    for _ in range(8):
+        for vehicle, (row, _) in zip(sorted(world.where()), starts, strict=True):
+            col = chance.randrange(2, 18)
+            world.send(vehicle, (row, col), (row, col + 1), (row - 1, col), then=then)
+            world.run(chance.random())
+        world.run(3.0)
+    assert len(reached) > 100
+    assert [(place, cell) for place, cell in reached if place != cell] == []
 
 
 # --- zones --------------------------------------------------------------------------------------------------
