@@ -38,7 +38,8 @@ _TIMEX_BYTES = 256
 """Above the size of Linux's `struct timex`, 208 bytes on 64-bit machines: the kernel writes all of it."""
 
 _PROCESS_BYTES = 31 << 20
-_VEHICLE_BYTES = 100 << 10
+_VEHICLE_BYTES = 230 << 10
+"""With the bytes of a process: 650 and 920 MB where 100 and 1,000 vehicles took 610 and 920 (`bench swarm`)."""
 _TREE_CELL_BYTES = 24
 _BUSY_SHARE = 3 / 4
 """Beyond this share of the cores ticks are late: none of them at 1.4 cores of 2, 10 % at 1.9."""
