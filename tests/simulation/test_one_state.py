@@ -260,7 +260,7 @@ def test_no_fact_shown_in_two_places_differs(scenario: Scenario, plan: Callable[
                 continue
             assert fact.text(report[fact.name]) == shown["table"].get(fact.label, fact.shown(state)), (place, fact)
     assert rows_in(texts["view"]) == rows_in(texts["table"]) == rows_in(texts["status"])
-    lasting = [alarm.line for alarm in state.standing_alarms]
+    lasting = [alarm.line for alarm in state.alarms if alarm.lasts]
     alarms = {place: {line for line in lasting if line in text} for place, text in texts.items()}
     assert alarms["view"] == alarms["table"] == alarms["status"] == set(lasting)
     told = [(each["kind"], each["about"], each["over_s"]) for each in values["report"]["alarms"]]
