@@ -75,6 +75,10 @@ def _until_started(vehicles: Sequence[str]) -> str:
     return f"{number_of(len(vehicles), 'vehicle')} ({first_of(vehicles)}), until swarm order vehicle start NAME"
 
 
+def _mean_gap(value: CertifiedGap) -> str:
+    return percent(value.mean)
+
+
 @dataclass(frozen=True, slots=True)
 class Fact:
     """Label and text of a field of a `RunState`, or of a `TargetLine`, of which it is a column.
@@ -132,7 +136,7 @@ class TargetLine:
     following: Annotated[int, Fact("chased by", count)]
     nearest_m: Annotated[float | None, Fact("nearest", distance)]
     captures: Annotated[int, Fact("captures", count)]
-    gap: Annotated[CertifiedGap | None, Fact("certified gap", lambda gap: percent(gap.mean))]
+    gap: Annotated[CertifiedGap | None, Fact("certified gap", _mean_gap)]
     growths: Annotated[int | None, Fact("re-plans", count)]
     growth_ms: Annotated[float | None, Fact("tree", duration)]
     routes_served: Annotated[int | None, Fact("served", count, always=False)]
