@@ -226,7 +226,7 @@ def with_photo(source: Source, photo: Photo, config: TerrainConfig, progress: Pr
     classes, readings = source.classes, None
     if config.labels is not None:
         labels = read_labels(Path(config.labels), source.grid)
-        classes = learnt(*inputs, labels.classes, photo.seen, progress)
+        classes = learnt(*inputs, labels.classes, progress) * photo.seen
         note = f"classes from the photo, learnt from {labels.count} labels"
     elif photo.other is not None:
         note = (
@@ -234,7 +234,7 @@ def with_photo(source: Source, photo: Photo, config: TerrainConfig, progress: Pr
             " its codes as terrain.cover"
         )
     else:
-        classes, readings = class_readings(*inputs, photo.seen, progress)
+        classes, readings = (each * photo.seen for each in class_readings(*inputs, progress))
         doubtful = float((classes[photo.seen] == TerrainClass.UNKNOWN).mean())
         note = (
             f"classes from the photo, by rules; {doubtful:.0%} of what it shows would be another class in a photo"

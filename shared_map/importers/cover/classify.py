@@ -330,11 +330,7 @@ class ByRules(NamedTuple):
 
 
 def class_readings(
-    rgb: Bytes,
-    elevation_m: Floats,
-    resolution_m: float,
-    seen: Bools | None = None,
-    progress: Progress = no_progress,
+    rgb: Bytes, elevation_m: Floats, resolution_m: float, progress: Progress = no_progress
 ) -> ByRules:
     """Classifies a photo by rules, without training labels. Returns the class of each cell, and for cells of class
     UNKNOWN the classes that are possible (readings).
@@ -346,8 +342,6 @@ def class_readings(
         Cells without a height (NaN) count as level.
     resolution_m : float
         Side of a cell, in metres. Roads are searched for only if it is at most `COARSEST_M` (30 m).
-    seen : bool (rows, cols), optional
-        Where the photo shows anything; elsewhere the class is UNKNOWN.
     progress : callable
         Called with the current step and the share of it that is done.
 
@@ -375,9 +369,6 @@ def class_readings(
         lines[spread(lakes, SHORE)] = 0
         classes[long_lines(lines)] = TerrainClass.ROAD
     classes[lakes] = TerrainClass.WATER
-    if seen is not None:
-        classes[~seen] = TerrainClass.UNKNOWN
-        readings[~seen] = 0
     readings *= classes == TerrainClass.UNKNOWN
     return ByRules(classes, readings)
 
@@ -456,18 +447,13 @@ def _stretched(columns: Floats) -> Floats:
 
 
 def learnt(
-    rgb: Bytes,
-    elevation_m: Floats,
-    resolution_m: float,
-    labels: Bytes,
-    seen: Bools | None = None,
-    progress: Progress = no_progress,
+    rgb: Bytes, elevation_m: Floats, resolution_m: float, labels: Bytes, progress: Progress = no_progress
 ) -> Bytes:
     """Classes of a photo learnt from labelled cells.
 
     Parameters
     ----------
-    rgb, elevation_m, resolution_m, seen, progress
+    rgb, elevation_m, resolution_m, progress
         As in `class_readings`.
     labels : uint8 (rows, cols), TerrainClass
         UNKNOWN where there is no label; at least one cell has one.
@@ -475,7 +461,7 @@ def learnt(
     Returns
     -------
     uint8 (rows, cols), TerrainClass
-        One of the labelled classes, or UNKNOWN where `seen` is false.
+        One of the labelled classes.
     """
     learner = Learner(*_samples(rgb, elevation_m, resolution_m, labels))
     classes = np.empty(rgb.shape[:2], np.uint8)
@@ -485,8 +471,6 @@ def learnt(
             classes[row0:row1, part] = learner.predict(features.columns()).reshape(features.red.shape)
 
     in_bands(len(classes), work, "classifying the photo", progress)
-    if seen is not None:
-        classes[~seen] = TerrainClass.UNKNOWN
     return classes
 
 

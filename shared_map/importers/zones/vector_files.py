@@ -17,7 +17,7 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, NamedTuple
 from xml.etree import ElementTree
 
 import msgspec
@@ -30,7 +30,6 @@ from pyogrio.raw import read
 
 from shared_map.importers.georeference import system_named
 from shared_map.importers.raster_files import DRAWINGS, beginning, faults_of, is_raster, number_of, other_format
-from shared_map.importers.zones.zone_files import IN_ARCHIVES, Kind, kind_of
 from swarm.config.explain import nearest
 from swarm.config.input_files import FileKind, check_bytes, read_bytes, size
 from swarm.errors import TerrainError
@@ -191,12 +190,30 @@ def parts_of(geometries: NDArray[Any]) -> tuple[NDArray[Any], NDArray[np.int64]]
 # --- which file ---------------------------------------------------------------------------------------------
 
 
+class Kind(NamedTuple):
+    """A format: GDAL's driver, and how its text is checked, as `formats.toml` says; empty of a binary format."""
+
+    driver: str
+    text: str
+
+
+# Atomic: what is skipped before the root is read in one way only, or a few hundred bytes would take for ever.
+_BEFORE_ROOT = r"(?:(?><\?.*?\?>|<!--.*?-->|<!DOCTYPE[^>\[]*>)\s*)*+"
+
+
+def kind_of(head: bytes) -> Kind | None:
+    """The format of a file by its first bytes; None if it is not read."""
+    text = head.removeprefix(b"\xef\xbb\xbf").lstrip().decode("latin-1")
+    rows = ((begins.replace("BEFORE_ROOT", _BEFORE_ROOT), row) for begins, row in DRAWINGS["begins"].items())
+    return next((Kind(*row) for begins, row in rows if re.match(begins, text, re.DOTALL)), None)
+
+
 def _source(path: Path, what: str) -> tuple[str | bytes, Kind]:
     """Returns GDAL's name for a file, whose text is checked, or its content as GeoJSON. Raises TerrainError on a
     file of another kind."""
     check_bytes(path, FileKind.VECTORS, what)
     try:
-        head, member, length = beginning(path, IN_ARCHIVES, FileKind.VECTORS, what)
+        head, member, length = beginning(path, DRAWINGS["zipped"], FileKind.VECTORS, what)
     except OSError as error:
         raise FileKind.VECTORS.unreadable(path, error) from error
     kind = kind_of(head)
@@ -211,9 +228,10 @@ def _source(path: Path, what: str) -> tuple[str | bytes, Kind]:
     source = str(absolute) if member is None else f"/vsizip/{{{absolute}}}/{member}"
     if not kind.text:
         return f"GPKG:{source}" if kind.driver == "GPKG" and member is None else source, kind
-    if member is not None and length > FileKind.VECTOR_TEXT.most_bytes:
-        raise FileKind.VECTOR_TEXT.refusal(path, f"{member} has {size(length)}")
-    data = _read(path, member)
+    if length > FileKind.VECTOR_TEXT.most_bytes:
+        most = f"at most {size(FileKind.VECTOR_TEXT.most_bytes)} of text are read"
+        raise FileKind.VECTOR_TEXT.refusal(path, f"{member or 'it'} has {size(length)}; {most}")
+    data = _read(_part(path, member), FileKind.VECTOR_TEXT)
     if kind.text == "xml":
         checked_xml(data, what)
         return source, kind
@@ -222,19 +240,11 @@ def _source(path: Path, what: str) -> tuple[str | bytes, Kind]:
 
 def _check_index(path: Path, source: str | bytes, what: str) -> int:
     """The number of shapes of a Shapefile, whose index must be its own: GDAL reads whatever lies where it says."""
-    _, _, member = str(source).partition("}/")
-    parts = []
-    for ending in (".shp", ".shx"):
-        part = b""
-        for name in (ending, ending.upper()):
-            with contextlib.suppress(KeyError, TerrainError):  # there is no such part
-                inner = str(Path(member).with_suffix(name)) if member else None
-                part = _read(path if member else path.with_suffix(name), inner, FileKind.VECTORS)
-        if not part:
-            lacking = Path(member or path).with_suffix(ending).name
-            raise TerrainError(f"{what} lacks {lacking}, its index: copy it, too, or ask for a GeoPackage")
-        parts.append(np.frombuffer(part, np.uint8))
-    shapes, index = parts
+    named = _part(path, str(source).partition("}/")[2])
+    beside = [each for ending in ("shx", "SHX") if (each := named.parent / f"{named.stem}.{ending}").exists()]
+    if not beside:
+        raise TerrainError(f"{what} lacks {named.stem}.shx, its index: copy it, too, or ask for a GeoPackage")
+    shapes, index = (np.frombuffer(_read(part, FileKind.VECTORS), np.uint8) for part in (named, beside[0]))
     at, length = 2 * index[100:][: len(index[100:]) // 8 * 8].view(">i4").reshape(-1, 2).T.astype(np.int64)
     end, ends = 2 * int(shapes[24:28].view(">i4")[0]), at + 8 + length
     inside = (at >= 100).all() and (length >= 4).all() and end <= ends.max(initial=100) <= len(shapes)
@@ -244,11 +254,13 @@ def _check_index(path: Path, source: str | bytes, what: str) -> int:
     return len(at)
 
 
-def _read(path: Path, member: str | None, kind: FileKind = FileKind.VECTOR_TEXT) -> bytes:
-    if member is None:
-        return read_bytes(path, kind)
-    with zipfile.ZipFile(path) as archive:
-        return archive.read(member)
+def _part(path: Path, member: str | None) -> Any:
+    """A file, or one in a .zip."""
+    return zipfile.Path(path, member) if member else path
+
+
+def _read(part: Any, kind: FileKind) -> bytes:
+    return read_bytes(part, kind) if isinstance(part, Path) else part.read_bytes()
 
 
 # --- GeoJSON ------------------------------------------------------------------------------------------------

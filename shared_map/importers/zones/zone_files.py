@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import re
 from collections import Counter
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import NamedTuple
@@ -13,30 +11,10 @@ import numpy as np
 
 from shared_map.array_files import Bools, Floats
 from shared_map.importers.georeference import crs_name, place_on
-from shared_map.importers.raster_files import DRAWINGS, is_raster, opened
+from shared_map.importers.raster_files import is_raster, opened
 from swarm.config.ground import ZoneConfig
 from swarm.errors import TerrainError
 from swarm.grid import GridSpec, Window
-
-
-class Kind(NamedTuple):
-    """A format: GDAL's driver, and how its text is checked, as `formats.toml` says; empty of a binary format."""
-
-    driver: str
-    text: str
-
-
-# Atomic: what is skipped before the root is read in one way only, or a few hundred bytes would take for ever.
-_BEFORE_ROOT = r"(?:(?><\?.*?\?>|<!--.*?-->|<!DOCTYPE[^>\[]*>)\s*)*+"
-IN_ARCHIVES: Sequence[str] = DRAWINGS["zipped"]
-
-
-def kind_of(head: bytes) -> Kind | None:
-    """The format of a file by its first bytes; None if it is not read."""
-    text = head.removeprefix(b"\xef\xbb\xbf").lstrip().decode("latin-1")
-    rows = ((begins.replace("BEFORE_ROOT", _BEFORE_ROOT), row) for begins, row in DRAWINGS["begins"].items())
-    return next((Kind(*row) for begins, row in rows if re.match(begins, text, re.DOTALL)), None)
-
 
 _NAMED = 5
 """Features that a note names at most. Chosen, not measured."""
@@ -71,8 +49,7 @@ class FileFacts:
             names.append(id)
 
 
-@dataclass(frozen=True, eq=False)
-class Burnt:
+class Burnt(NamedTuple):
     """Cells of a zone's file. Each part has a window of its own.
 
     values   float32; the factor or pace of each cell, of roads relative to the road pace; NaN where there is none
