@@ -259,7 +259,8 @@ def test_costs_are_exact_whatever_the_width_of_the_buckets(ground: str, width: f
 
 @pytest.mark.parametrize("directed", [True, False])
 def test_no_costs_make_a_growth_many_times_as_long(directed: bool) -> None:
-    """CPU time of 64 x 64 cells, over that of ordinary ground, in turn: at most 10, measured 0.9 to 5."""
+    """CPU time of 64 x 64 cells, over that of ordinary ground, in turn: at most 20, measured 0.9 to 10, by
+    the processor."""
     climb = random_climb(np.random.default_rng(1), GridSpec(64, 64, 1.0), 0.1, 10.0) if directed else None
 
     def grow(draw: Paces) -> Callable[[], float]:
@@ -281,4 +282,4 @@ def test_no_costs_make_a_growth_many_times_as_long(directed: bool) -> None:
         if "e+30" not in name:  # costs whose sums leave float32
             other = grow(draw)
             slow[name] = round(statistics.median(other() / plain() for _ in range(5)), 1)
-    assert max(slow.values()) < 10, slow
+    assert max(slow.values()) < 20, slow

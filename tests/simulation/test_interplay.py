@@ -350,7 +350,7 @@ class Interplay:
             return ["the keeper is dead at the end"]
         kept, found = keeper._orders.book, []
         for order in simulation.book:
-            if not kept.knows(order.subject, order.name, order.stamp_ns):
+            if not kept.has((order.subject, order.name), order.stamp_ns):
                 found.append(f"the keeper has lost {order}")
         for node in simulation.nodes.values():
             client = getattr(node.service, "_order_client", None)
