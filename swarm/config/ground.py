@@ -202,11 +202,11 @@ def whole_cost(common: dict[str, Any], own: dict[str, Any]) -> dict[str, Any]:
 
 
 class _WithPreset(SectionType):
-    """A section which, made in Python, has its preset's values, as from a file. Raises ConfigError on no preset."""
+    """A section which, made in Python, has its preset's values, as from a file. Raises ConfigError on another name."""
 
     def __call__(self, *args: Any, **settings: Any) -> Any:
-        if (name := settings.get("preset")) not in (None, *PRESETS):
-            raise ConfigError(f"no preset {quoted(name)}{choice(str(name), list(PRESETS), ' there are ')}")
+        if isinstance(name := settings.get("preset"), str) and name not in PRESETS:
+            raise ConfigError(f"no preset {quoted(name)}{choice(name, list(PRESETS), ' there are ')}")
         return super().__call__(*args, **whole_cost({}, settings))
 
 
