@@ -202,7 +202,7 @@ def whole_cost(common: dict[str, Any], own: dict[str, Any]) -> dict[str, Any]:
 
 
 class _WithPreset(SectionType):
-    """A section which, made in Python, has its preset's values, as from a file. Raises ConfigError on another name."""
+    """A section which, made in Python, has its preset's values, as from a file. Raises ConfigError if unknown."""
 
     def __call__(self, *args: Any, **settings: Any) -> Any:
         if isinstance(name := settings.get("preset"), str) and name not in PRESETS:
