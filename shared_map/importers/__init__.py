@@ -15,3 +15,7 @@ in memory: those of `plain_grids`, which has maps without heights, too. `height_
 `water_and_voids` finds water and voids in a file's own cells, before anything is resampled. Land cover and photos
 are in `cover`, vector zones in `zones`; codes, colours and classes of ways are data beside their readers.
 """
+
+from swarm.errors import require
+
+require(__name__, "rasterio")
