@@ -297,8 +297,8 @@ def logs(
     width, read = max(map(len, names), default=0), dict[int, int]()
     told: Iterable[_Line] = _new_lines(found.folder, process, read)
     told = told if lines is None else deque(told, maxlen=lines)
-    with suppress(KeyboardInterrupt), stop_requests():
-        while True:
+    with suppress(KeyboardInterrupt), stop_requests() as stopping:
+        while not stopping():
             for _, name, text in told:
                 typer.echo(plain(text) if process else f"{name:<{width}} | {plain(text)}")
             if not follow:

@@ -276,7 +276,7 @@ def show_top(where: Where, *, each: bool, once: bool, as_json: bool) -> None:
     terminal.make_output_outlive_readers()
     console = terminal.whole_output()
     moving = console.is_terminal and not as_json and not once
-    with suppress(KeyboardInterrupt), stop_requests(), where.bus() as bus:
+    with suppress(KeyboardInterrupt), stop_requests() as stopping, where.bus() as bus:
         observer, clock = observed(bus, where, _TOP_LISTEN_S), MonotonicClock()
         run, latest = observer.run, observer.latest
         if run is None or latest is None:
@@ -292,7 +292,7 @@ def show_top(where: Where, *, each: bool, once: bool, as_json: bool) -> None:
                     console.print(table_of(run, state, processes, console, each=each))
                 else:
                     live.update(table_of(run, state, processes, console, each=each), refresh=True)
-                if once:
+                if once or stopping():
                     return
                 if observer.over or all(role == "router" for role, _ in latest.up()):
                     break

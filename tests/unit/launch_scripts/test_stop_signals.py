@@ -16,6 +16,8 @@ import pytest
 from support import contained
 from support.processes import eventually
 
+from launch_scripts.commands import run_commands
+from launch_scripts.observe.run_folders import KnownRun
 from launch_scripts.stop_requests import StopAsked, stop_requests
 
 NUMBERS = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
@@ -150,6 +152,21 @@ def test_a_request_is_known_though_a_library_swallows_the_exception(number: sign
         with pytest.raises(KeyboardInterrupt):
             signal.raise_signal(number)
     assert signal.getsignal(number) is before
+
+
+def test_followed_logs_end_though_a_library_swallows_the_exception(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    active = KnownRun(tmp_path, (1,), 0, False)
+
+    def swallows(folder: Path) -> KnownRun:
+        with suppress(BaseException):
+            signal.raise_signal(signal.SIGTERM)
+        return active
+
+    monkeypatch.setattr(run_commands, "_chosen", lambda run: active)
+    monkeypatch.setattr(run_commands, "_run_in", swallows)
+    run_commands.logs(follow=True)
 
 
 # --- processes that ./launch_scripts/test starts end with it ----------------------------------------------------
