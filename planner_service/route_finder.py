@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import suppress
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
@@ -244,7 +245,9 @@ def _whole(place: Any) -> tuple[int, int]:
 
 def _paces(given: Any) -> NDArray[np.float32]:
     """A copy of paces. Raises ArgumentError where one is no number above 0; what only float32 makes inf is none."""
-    values = np.asanyarray(given)
+    values = np.array(None)
+    with suppress(ValueError):  # rows of different lengths
+        values = np.asanyarray(given)
     if values.dtype.kind not in "iuf" or np.ma.is_masked(values):
         raise ArgumentError(
             f"pace is {values.dtype}, or masked in part; expected numbers, and inf where it is lethal"

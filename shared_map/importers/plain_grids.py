@@ -7,11 +7,9 @@ is not used: it fills missing points with 0 where 0 is a height, too, and refuse
 
 from __future__ import annotations
 
-import io
 import itertools
 import math
 import re
-import zipfile
 from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
 from typing import Annotated, Any, Literal, NamedTuple
@@ -27,7 +25,7 @@ from rasterio.transform import from_origin
 
 from shared_map.array_files import Floats
 from shared_map.importers.georeference import METRES, check_size
-from shared_map.importers.raster_files import LONGEST_REASON, Numbers, faults_of
+from shared_map.importers.raster_files import LONGEST_REASON, Numbers, ShortReads, faults_of
 from swarm.config.explain import explain
 from swarm.config.input_files import FileKind, check_bytes, read_lines, read_text, size
 from swarm.errors import TerrainError
@@ -36,8 +34,6 @@ _NPZ_ARRAYS = ("elevation", "resolution_m", "dx", "dy", "xmin", "ymin", "ymax")
 _READ_ARRAYS = "elevation and resolution_m, or elevation, dx, dy, xmin and ymin (degrees)"
 _HEADER_BYTES = 4096
 """Bytes of an array's header that NumPy parses; headers of grids have some 120."""
-_MOST_TABLE_BYTES = 1 << 20
-"""Limit of an archive's table of contents."""
 _SHOWN_MEMBERS = 10
 """Unread arrays that a sentence names at most. Chosen, not measured."""
 MAX_STEP = 1e7
@@ -94,7 +90,7 @@ def _members(path: Path, what: str) -> tuple[dict[str, NDArray[Any]], list[str]]
     kind = FileKind.ARRAYS
     check_bytes(path, kind)
     faults = faults_of(f"{what} is truncated or no .npz of numbers")
-    with faults, _ShortReads(path) as file, np.load(file, max_header_size=_HEADER_BYTES) as archive:
+    with faults, ShortReads(path) as file, np.load(file, max_header_size=_HEADER_BYTES) as archive:
         wanted = [name for name in _NPZ_ARRAYS if name in archive.files]
         total = sum(archive.zip.getinfo(f"{name}.npy").file_size for name in wanted)
         if total > kind.most_bytes:
@@ -102,16 +98,6 @@ def _members(path: Path, what: str) -> tuple[dict[str, NDArray[Any]], list[str]]
             raise kind.refusal(path, f"its arrays would unpack to {size(total)}; at most {most} are read")
         unread = sorted(set(archive.files) - {*_NPZ_ARRAYS, "xmax"})
         return {name: archive[name] for name in wanted}, [name[:40] for name in unread[:_SHOWN_MEMBERS]]
-
-
-class _ShortReads(io.FileIO):
-    """A file that limits each read, so that an archive's table of contents is bounded, too."""
-
-    def read(self, count: int | None = -1) -> bytes:
-        """Raises BadZipFile where more than `_MOST_TABLE_BYTES` are asked for."""
-        if count is not None and count > _MOST_TABLE_BYTES:
-            raise zipfile.BadZipFile(f"its table of contents has {size(count)}")
-        return super().read(-1 if count is None else count) or b""
 
 
 # --- maps without heights -----------------------------------------------------------------------------------
@@ -342,7 +328,7 @@ def _points_of(path: Path, what: str) -> tuple[Callable[[], Iterator[Points]], b
 
     def numbers_of(lines: Iterable[str]) -> Points:
         filled = lines if empty is None else [empty.sub("nan", each.replace(decimal, ".")) for each in lines]
-        return np.loadtxt(filled, np.float64, delimiter=mark, usecols=columns, ndmin=2, comments=None)
+        return np.loadtxt(filled, delimiter=mark, usecols=columns, ndmin=2, comments=None, quotechar='"')
 
     def points() -> Iterator[Points]:
         kept = (each for each in _lines(path) if each[0] != header)

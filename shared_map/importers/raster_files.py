@@ -9,6 +9,7 @@ from __future__ import annotations
 import codecs
 import contextlib
 import glob
+import io
 import itertools
 import math
 import os
@@ -72,6 +73,8 @@ _MAX_PIXELS = 16 * MAX_CELLS
 """Limit for formats which are read a part at a time. Of others, `MAX_CELLS`."""
 _MAX_BLOCK_BYTES = 512 << 20
 """A block is unpacked as a whole."""
+_MOST_TABLE_BYTES = 1 << 20
+"""Limit of an archive's table of contents."""
 _MAX_BANDS = 256
 """Hyperspectral cameras have some 240, and four are needed at most. A header may claim 65,535, each of which GDAL
 describes in memory."""
@@ -346,6 +349,16 @@ def _kind_of(path: Path, what: str) -> tuple[str | Path, str, int]:
     return plain if member is None else f"/vsizip/{{{path}}}/{member}", driver, length
 
 
+class ShortReads(io.FileIO):
+    """A file that limits each read, so that an archive's table of contents is bounded, too."""
+
+    def read(self, count: int | None = -1) -> bytes:
+        """Raises BadZipFile where more than `_MOST_TABLE_BYTES` are asked for."""
+        if count is not None and count > _MOST_TABLE_BYTES:
+            raise zipfile.BadZipFile(f"its table of contents has {size(count)}")
+        return super().read(-1 if count is None else count) or b""
+
+
 def beginning(path: Path, endings: Sequence[str], kind: FileKind, what: str) -> tuple[bytes, str | None, int]:
     """The first bytes of a file, no name, and its size; of a .zip those of the one file in it with such an ending.
 
@@ -360,7 +373,7 @@ def beginning(path: Path, endings: Sequence[str], kind: FileKind, what: str) -> 
         head = file.read(_HEAD_BYTES)
     if not head.startswith(b"PK"):
         return head, None, length
-    with faults_of(f"{what} is damaged or no .zip"), zipfile.ZipFile(path) as archive:
+    with faults_of(f"{what} is damaged or no .zip"), ShortReads(path) as file, zipfile.ZipFile(file) as archive:
         # Finder adds a folder of its own.
         files = [each for each in archive.infolist() if not re.search(r"^__MACOSX/|/$", each.filename)]
         named = [each.filename for each in files if Path(each.filename).suffix.lower() in endings]

@@ -12,7 +12,7 @@ from support.planner_strategies import random_pace
 import planner_service
 from planner_service import RouteFinder
 from swarm.config.scenario import Strategy
-from swarm.errors import ConfigError, OutsideGridError
+from swarm.errors import ArgumentError, ConfigError, OutsideGridError
 from swarm.wire.route_columns import RouteStatus, TargetStatus
 
 
@@ -112,6 +112,9 @@ def test_a_place_between_cells_and_an_unknown_setting_are_refused() -> None:
 )
 def test_what_is_no_pace_is_refused_with_and_without_a_target(pace: Any) -> None:
     ground = np.ones((3, 3))
+    ragged: Any = [[1.0, 2.0], [3.0]]
+    with pytest.raises(ArgumentError, match="pace is object"):
+        RouteFinder(ragged, target=(0, 0))
     for shape, complaint in ((4, "1 dimensions, expected 2"), ((0, 3), "at least one cell")):
         with pytest.raises(ValueError, match=complaint):
             RouteFinder(np.ones(shape), target=(0, 0))

@@ -369,7 +369,7 @@ def test_a_stated_extent_is_closed_up_to_its_edge(tmp_path: Path, tags: dict[str
 @pytest.mark.parametrize(
     "tags",
     [{"radius": "wide"}, {"radius_nm": 3}, {"Radius": -5}, {"width": 20_000}, {"radius": [1, 2]}, {"buffer_m": 50},
-        {"range": 80}, {"Dist": 80.0}, {"safetyDistance": "80 m"}, {"RANGE_M": 8}, {"BUFF_DIST": 8}, {"rayon": 80}],
+        {"range": 8}, {"Dist": 8}, {"safetyDistance": "80 m"}, {"RANGE_M": 8}, {"BUFF_DIST": 8}, {"Halbmesser": 8}],
 )  # fmt: skip
 def test_an_extent_that_cannot_be_read_is_refused_by_name(tmp_path: Path, tags: dict[str, Any]) -> None:
     file = geojson(tmp_path / "a.geojson", [feature(shapely.Point(15.5, 14.5), **tags)])

@@ -1,5 +1,6 @@
 """Plain formats: right files are read, and wrong ones are refused with the line."""
 
+import re
 from pathlib import Path
 from typing import Any
 
@@ -203,6 +204,7 @@ def text_of(points: Any, between: str = " ", header: str = "", end: str = "\n") 
         ("a.csv", text_of([(z, n, x, y) for n, (x, y, z) in enumerate(POINTS)], ",", "z,id,x,y")),
         ("a.csv", text_of([(y, x, z) for x, y, z in POINTS], ",", "north,east,height")),
         ("a.csv", text_of(POINTS, ",", end=",\n")),
+        ("a.csv", re.sub(r"[^,\n]+", r'"\g<0>"', text_of(POINTS, ",", "x,y,z"))),
         ("a.xyz", text_of(POINTS) + "\n\n"),
         ("a.xyz", text_of(POINTS).rstrip()),
         ("a.xyz", text_of([*POINTS, *POINTS[:5]])),

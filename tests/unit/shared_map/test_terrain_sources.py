@@ -269,6 +269,7 @@ BAD: list[tuple[Callable[[Path], dict[str, Any]], str]] = [
     (lambda f: vrt(f, vrt(f, dem(f)["source"].name, 40, "b.vrt")["source"].name), "paints its pixels 40 times"),
     (lambda f: vrt(f, text(f, "wms.xml")["source"].name), r"wms\.xml is no raster"),
     (lambda f: packed(f, "a.tif", "b.tif"), "holds 2 files of the kinds .tif"),
+    (lambda f: packed(f, "a.tif", *(f"{n}{'x' * 60_000}" for n in range(20))), "its table of contents has 1.2 MB"),
     (lambda f: spoilt(packed(f, "a.tif")), r"a\.zip"),
     (lambda f: spoilt(packed(f, "a.tif", method=zipfile.ZIP_LZMA)), r"a\.zip"),
     (lambda f: spoilt(packed(f, "a.tif", method=zipfile.ZIP_BZIP2)), r"a\.zip"),
