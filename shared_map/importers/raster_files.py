@@ -373,7 +373,7 @@ def beginning(path: Path, endings: Sequence[str], kind: FileKind, what: str) -> 
         head = file.read(_HEAD_BYTES)
     if not head.startswith(b"PK"):
         return head, None, length
-    with faults_of(f"{what} is damaged or no .zip"), ShortReads(path) as file, zipfile.ZipFile(file) as archive:
+    with faults_of(f"{what} is damaged or no .zip"), ShortReads(path) as short, zipfile.ZipFile(short) as archive:
         # Finder adds a folder of its own.
         files = [each for each in archive.infolist() if not re.search(r"^__MACOSX/|/$", each.filename)]
         named = [each.filename for each in files if Path(each.filename).suffix.lower() in endings]

@@ -316,3 +316,18 @@ def test_an_import_hands_on_what_its_photo_may_show() -> None:
     found = with_photo(source, Photo(photo, seen, ()), TerrainConfig(), lambda what, share: None)
     assert (found.readings[5:35, 5:25] == BIT[TerrainClass.GRASS] | BIT[TerrainClass.FOREST]).mean() > 0.9
     assert not found.readings[5:35, 35:].any()
+
+
+def test_what_a_photo_does_not_show_is_unknown(tmp_path: Path) -> None:
+    labels = tmp_path / "labels.toml"
+    labels.write_text("".join(
+        f'[[labels]]\nclass = "{kind}"\npoints_m = [[{x}, 205]]\n' for kind, x in (("grass", 405), ("forest", 505))
+    ))  # fmt: skip
+    photo = np.random.default_rng(2).integers(60, 200, (40, 60, 3)).astype(np.uint8)
+    source = Source(GridSpec(40, 60, 10.0), np.zeros((40, 60), np.float32), np.zeros((40, 60), np.uint8))
+    seen = np.broadcast_to(np.arange(60) >= 30, (40, 60))
+    for config in (TerrainConfig(), TerrainConfig(labels=str(labels))):
+        found = with_photo(source, Photo(photo, seen, ()), config, lambda what, share: None)
+        assert not found.classes[~seen].any()
+        assert found.classes[seen].any()
+        assert found.readings is None or not found.readings[~seen].any()

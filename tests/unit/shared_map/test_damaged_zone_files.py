@@ -346,9 +346,23 @@ def test_a_part_of_another_shapefile_is_refused(tmp_path: Path) -> None:
             (tmp_path / f"mixed{part}").write_bytes(source.with_suffix(part).read_bytes())
         with pytest.raises(TerrainError, match=r"is damaged: its \.shx is that of another file"):
             closed_by(str(tmp_path / "mixed.shp"), "forbidden")
+    for part in (".shp", ".shx", ".dbf", ".prj"):
+        files[0].with_suffix(part).rename(tmp_path / f"CAPITAL{part.upper()}")
+    assert closed_by(str(tmp_path / "CAPITAL.SHP"), "forbidden").any()
+    os.truncate(tmp_path / "mixed.shx", 2 << 30)
+    with pytest.raises(TerrainError, match=r"mixed\.shx: it has 2\.1 GB; at most"):
+        closed_by(str(tmp_path / "mixed.shp"), "forbidden")
     (tmp_path / "mixed.shx").unlink()
     with pytest.raises(TerrainError, match=r"mixed\.shp lacks mixed\.shx, its index: copy it, too"):
         closed_by(str(tmp_path / "mixed.shp"), "forbidden")
+
+
+def test_a_text_that_is_too_large_is_refused_before_it_is_read(tmp_path: Path) -> None:
+    path = tmp_path / "zone.geojson"
+    path.write_text("{")
+    os.truncate(path, 300 << 20)
+    with pytest.raises(TerrainError, match="of text are read"):
+        closed_by(str(path), "forbidden")
 
 
 # --- extents and fences -------------------------------------------------------------------------------------
