@@ -41,6 +41,8 @@ _MOST_NAMES = 1 << 14
 """Processes, targets and authors that are remembered, of each: on loopback any program may use any name."""
 _MOST_SETS = 1 << 17
 """Sets of marks that are remembered: enough for eight authors on each tile of 4096 x 4096 cells."""
+_MOST_TOMBSTONES = 64
+"""Number of ended sets that are remembered: an older one which is on its way comes in seconds. Chosen, not measured."""
 _ODD_POSES = ("poses_refused", "poses_outside")
 """Counts of planners: poses which do not count."""
 
@@ -212,12 +214,14 @@ class LatestState(Counts):
         """Id -> its last report, and the time of its arrival."""
         self._fleets: dict[tuple[str, int], Fleet] = {}
         """(agent, region) -> its last report, of whichever generation."""
-        self._reports = Newest()
+        self._reports = Newest(_MOST_NAMES)
         """Detection of reports that are newer than the last of an agent's vehicles in a region."""
         self._vehicles: VehicleColumns | None = None
         """The vehicles of `_fleets`, once asked for; None since the last news."""
         self._marks: dict[tuple[str, int], MarkSet] = {}
         """(author, tile) -> its set, until a keeper says that nothing of it is left."""
+        self._tombstones: dict[tuple[str, int], MarkSet] = {}
+        """(author, tile) -> these last words of keepers, the newest: an older set may still be on its way."""
         self._ranks: dict[tuple[str, str], int] = {}
         """(role, job) -> rank of the process that leads, where there are standbys."""
         self._beats = Newest(silence_ns=FOR_GOOD_NS)
@@ -265,11 +269,14 @@ class LatestState(Counts):
                 return self._trackings.counted(message, now_ns)
             case MarkSet():
                 of = (message.author, message.tile)
-                marks = self._marks.get(of)
+                marks = self._marks.get(of) or self._tombstones.get(of)
                 if marks is None or supersedes(message, marks):
                     _remember(self._marks, of, message, _MOST_SETS)
                     if is_tombstone(message):
                         self._marks.pop(of, None)
+                        self._tombstones[of] = message
+                        if len(self._tombstones) > _MOST_TOMBSTONES:
+                            del self._tombstones[next(iter(self._tombstones))]
             case GoalStates(states=states):
                 for each in states:
                     _remember(self._goals, each.name, each)

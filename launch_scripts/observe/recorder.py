@@ -78,7 +78,7 @@ class Sample(NamedTuple):
 
     shown       name of a series of the report -> its value; None until it is published
     gap_excess  int64 (n, 2): bucket and count of the histogram of certified gaps - 1 of all routes that were begun
-                until then; packed, as a thousand of them are kept
+                until then; packed, as hundreds of them are kept
     at_rest_s   (waiting, standing), seconds of all vehicles together until `driven_s`, as `Driven` counts them
     driven_s    UNIX time of the last count of these; 0 before
     """

@@ -163,6 +163,7 @@ def test_an_hour_of_kills_leaves_as_much_in_memory_as_a_minute_of_them_and_no_co
             author, gone = f"a0.{n:x}", set_of(f"a0.{n - 1:x}", 1, 1, {})
             marks = [set_of(author, 1, 1, {3: (MarkKind.LETHAL, 0.0, n)})]
             marks.append(msgspec.structs.replace(gone, seq=gone.seq + 1))  # a keeper has compacted it
+            marks.append(set_of(gone.author, 1, 1, {3: (MarkKind.LETHAL, 0.0, n - 1)}))  # and it comes late
             for message in (generation, late, fleet(author, {"a0-00": (n, 1.0)}, n, region=n % 2), *marks):
                 latest.heard(message, n * NS_PER_S)
             assert latest.vehicles().east_m.tolist() == [n]
