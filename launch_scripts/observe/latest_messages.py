@@ -42,7 +42,7 @@ _MOST_NAMES = 1 << 14
 _MOST_SETS = 1 << 17
 """Sets of marks that are remembered: enough for eight authors on each tile of 4096 x 4096 cells."""
 _MOST_TOMBSTONES = 64
-"""Number of ended sets that are remembered: an older one which is on its way comes in seconds. Chosen, not measured."""
+"""Number of ended sets that are remembered: an older one which is on its way comes in seconds. Chosen."""
 _ODD_POSES = ("poses_refused", "poses_outside")
 """Counts of planners: poses which do not count."""
 
