@@ -21,6 +21,7 @@ from swarm.clock import NS_PER_S
 from swarm.config.scenario import Scenario, agent_of, crew_of
 from swarm.grid import TILE_CELLS, GridSpec
 from swarm.peers import FOR_GOOD_NS, HIGHEST_RANK, Newest, Peer, ranked_id, split_rank
+from swarm.right_of_way.generations import keep_last
 from swarm.runtime.order_book import OrderBook
 from swarm.runtime.stats import ENDED
 from swarm.runtime.tracker_ownership import Trackings
@@ -271,12 +272,11 @@ class LatestState(Counts):
                 of = (message.author, message.tile)
                 marks = self._marks.get(of) or self._tombstones.get(of)
                 if marks is None or supersedes(message, marks):
-                    _remember(self._marks, of, message, _MOST_SETS)
                     if is_tombstone(message):
                         self._marks.pop(of, None)
-                        self._tombstones[of] = message
-                        if len(self._tombstones) > _MOST_TOMBSTONES:
-                            del self._tombstones[next(iter(self._tombstones))]
+                        keep_last(self._tombstones, of, message, _MOST_TOMBSTONES)
+                    else:
+                        _remember(self._marks, of, message, _MOST_SETS)
             case GoalStates(states=states):
                 for each in states:
                     _remember(self._goals, each.name, each)

@@ -78,7 +78,7 @@ class Histogram:
         """Counts each value as `add` does, in a fixed order because the order of buckets reaches the wire: positive
         values from the least to the greatest, then all others."""
         if values.size <= _FEW:
-            for value in sorted(values.tolist(), key=lambda value: (value <= 0, value)):
+            for value in sorted(filter(math.isfinite, values.tolist()), key=lambda value: (value <= 0, value)):
                 self.add(value)
             return
         values = values[np.isfinite(values)]

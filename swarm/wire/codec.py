@@ -300,8 +300,7 @@ def packed_json(
 
 
 def encode_json(message: Message, key: str = "") -> bytes:
-    """A message as JSON for people. Routes are listed one by one, with the cells that they pass if it tells the
-    grid.
+    """A message as JSON for people. Routes are listed one by one, those to targets with the cells that they pass.
 
     key  for which it is meant, below the namespace
     """
@@ -426,7 +425,7 @@ def _quoted(given: Any) -> str:
 
 
 def _cells_row_col(route: Route, reply: RouteReply | PlaceRouteReply) -> dict[str, list[list[int]]]:
-    if isinstance(reply, PlaceRouteReply):
+    if isinstance(reply, PlaceRouteReply):  # which does not tell the grid
         return {}
     row, col = divmod(route.start, reply.cols)
     cells = [[row, col]]
