@@ -24,6 +24,7 @@ from launch_scripts.observe.alarms import Alarm
 from launch_scripts.observe.latest_messages import LatestState, VehicleColumns
 from launch_scripts.observe.run_state import RunState
 from launch_scripts.observe.summed_counts import percent
+from launch_scripts.plain_text import first_of
 from shared_map.replication.interest import MarkFilter
 from shared_map.sightings import Sightings
 from swarm.clock import NS_PER_S
@@ -418,7 +419,12 @@ class MoversView:
         )
         ends = feet(self._mesh, tops)
         self._pen.lines("world/goals/ways", even(np.stack([starts, ends], axis=1)), colours)
-        self._draw_labels("world/goals/names", tops, 1.0, [each.name for each, _, _ in ways])
+        sent: dict[int, list[str]] = {}  # one label a place: that of a vehicle alone would read like the vehicle
+        for each, _, cell in ways:
+            sent.setdefault(cell, []).append(each.name)
+        _, first = np.unique(cells, return_index=True)
+        texts = [f"place of {first_of(sent[int(cells[n])])}" for n in first]
+        self._draw_labels("world/goals/names", tops[first], 1.0, texts)
 
     def _draw_labels(self, entity: str, places: Floats, above: float, texts: list[str]) -> None:
         """Draws as many labels as can be read, at this height (`scale_m`) above their positions."""

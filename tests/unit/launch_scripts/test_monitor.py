@@ -197,6 +197,17 @@ def test_what_is_told_is_drawn_when_it_changes_and_taken_away_when_it_is_over(tm
     assert [len(row) for row in rows] == instances
 
 
+def test_vehicles_sent_to_one_place_share_its_label(tmp_path: Path) -> None:
+    rig = Rig(SCENARIO, TERRAIN, tmp_path / "run.rrd")
+    states = [msgspec.structs.replace(SENT, name=name) for name in ("a0-00", "a0-01")]
+    places = GoalStates(agent="a0", stamp_ns=1, states=states)
+    rig.play([(NS_PER_S // 4, fleet(1.0, ("a0-00", 3), ("a0-01", 4))), (NS_PER_S // 2, places)])
+    rig.run(2)
+    rig.close()
+    labels = components(tmp_path / "run.rrd", "/world/goals/names")["labels"]
+    assert list(labels[-1]) == ["place of a0-00, a0-01"]
+
+
 def test_no_recording_replaces_another(tmp_path: Path) -> None:
     assert [new_recording_path(tmp_path).name for _ in range(3)] == ["run.rrd", "run-2.rrd", "run-3.rrd"]
 
