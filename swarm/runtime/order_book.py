@@ -215,7 +215,8 @@ def described(order: Order | VehicleGoals) -> str:
     """An order in words."""
     if isinstance(order, VehicleGoals):
         count = len(order.cells)
-        then = f"goes to {count} {'place' if count == 1 else 'places'}, then {order.then}; {order.done} reached"
+        reached = f"; {order.done} reached" if order.done else ""
+        then = f"goes to {count} {'place' if count == 1 else 'places'}, then {order.then}{reached}"
         return f"vehicle {order.name} {'is recalled' if order.off else then}"
     words: Iterable[object] = (
         order.subject,
