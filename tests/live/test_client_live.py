@@ -57,7 +57,7 @@ class Run:
             self.process.kill()
 
 
-@pytest.mark.parametrize("name", ["vehicle.py", "target.py"])
+@pytest.mark.parametrize("name", ["vehicle.py", "reserving_vehicle.py", "target.py"])
 def test_a_complete_program_has_twenty_lines_at_most(name: str) -> None:
     assert len([line for line in (EXAMPLES / name).read_text().splitlines() if line.strip()]) <= 20
 
@@ -91,6 +91,17 @@ def test_the_rover_of_the_page_joins_drives_to_its_target_marks_and_leaves(live:
         said = next(each for (_, author), each in watching._sets.items() if ".rover." in author)
         assert set(struct.unpack(f"<{len(said.paces) // 4}f", said.paces)) == {0.5}
         assert (first.state, first.group) == ("outside", "all")
+
+
+def test_the_rover_of_the_page_enters_only_what_it_reserves(live: LiveSwarm) -> None:
+    with connect(live.endpoint) as swarm, swarm.observer() as watching:
+        run = Run((EXAMPLES / "reserving_vehicle.py").read_text(), live.endpoint)
+        eventually(lambda: "rover" in watching.vehicles, 20, "the rover's first word")
+        start = watching.vehicles["rover"].x_m, watching.vehicles["rover"].y_m
+        eventually(
+            lambda: (watching.vehicles["rover"].x_m, watching.vehicles["rover"].y_m) != start, 20, "its driving"
+        )
+    assert (run.end(within_s=90), run.process.returncode) == ("", 0)
 
 
 def test_the_tracker_of_the_page_moves_its_target_and_the_planner_follows(live: LiveSwarm, swarm: Swarm) -> None:
