@@ -86,6 +86,8 @@ def bounds_of(meta: msgspec.Meta) -> list[str]:
         return [meta.description]
     if meta.pattern is not None:
         return ["digits"] if meta.pattern.startswith("^[0-9]{") else ["of letters, digits, '_', '.' and '-'"]
+    if (most := meta.max_length) is not None:
+        return [f"of {meta.min_length} to {most:,}" if meta.min_length else f"of up to {most:,}"]
     if meta.min_length is not None:
         return ["not empty" if meta.min_length == 1 else f"of at least {meta.min_length}"]
     if low is not None and high is not None:
