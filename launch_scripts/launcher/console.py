@@ -222,7 +222,7 @@ class OutlivingOutput:
         except OSError as error:
             if error.errno not in _READER_GONE:
                 raise
-            log.info("the output has no reader any more: %s", error.strerror or error)
+            log.info("nobody reads the terminal output any more; this log goes on")
             discard_output(self._stream.fileno())
 
 

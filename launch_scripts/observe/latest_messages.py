@@ -438,8 +438,12 @@ class LatestState(Counts):
         return now_ns - self._fleet_told_ns.get(agent, 0) <= _VEHICLES_LAST_NS  # it raises no token
 
     def tells_of_vehicles(self, agent: str) -> bool:
-        """Returns True if the agent has published its vehicles."""
-        return agent in self._fleet_told_ns
+        """Returns True if the agent has published its vehicles, and the places of those which were sent there:
+        they have no target, and are not idle."""
+        fleets = [fleet for fleet in self._fleets.values() if fleet.ids and agent_of(fleet.ids[0]) == agent]
+        rows = (row for fleet in fleets for row in zip(fleet.ids, fleet.targets, fleet.states, strict=True))
+        sent = (id for id, target, state in rows if target == NO_TARGET and state != VehicleState.IDLE)
+        return agent in self._fleet_told_ns and all(id in self._goals for id in sent)
 
     def external(self, now_ns: int) -> dict[str, Obstacle]:
         """Returns the external vehicles and other obstacles whose lease has not ended, in order of id."""

@@ -32,7 +32,7 @@ from swarm.runtime.stats import ENDED, VIEWERS
 from swarm.wire.messages.orders import GoalState, GoalStates, Order, Orders
 from swarm.wire.messages.processes import Alarm, Note, Stats
 from swarm.wire.messages.vehicles import Fleet, Followed, Obstacle
-from swarm.wire.topics import FLEET, FOLLOWED, NOTE, ORDERS, POSE, RUN, STATS, STATUS, TOPICS
+from swarm.wire.topics import FLEET, FOLLOWED, GOAL_STATES, NOTE, ORDERS, POSE, RUN, STATS, STATUS, TOPICS
 
 
 def begun() -> tuple[SwarmModel, Watcher, list[object]]:
@@ -273,6 +273,11 @@ def test_what_was_heard_before_the_members_answered_is_part_of_the_run() -> None
     assert latest.first_ns == 5
     assert not observer.whole, "a0 has not said what it counts"
     observer.take(Heard(STATS, {}, COUNTED), 7)
+    assert observer.whole
+    observer.take(Heard(FLEET, {}, fleet(200.0, ("a0-00", 1), target=None)), 8)
+    assert not observer.whole, "it drives to a place which a0 has not told"
+    goal = GoalState(name="a0-00", stamp_ns=1, done=0, state="underway", cell=9)
+    observer.take(Heard(GOAL_STATES, {}, GoalStates(agent="a0", stamp_ns=1, states=[goal])), 9)
     assert observer.whole
 
 
