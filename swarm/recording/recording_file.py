@@ -326,8 +326,8 @@ def record_of(event: bus.Event, now_ns: int) -> Handled:
 
 
 def rest_of(record: Handled) -> dict[str, Any]:
-    """Returns the content of a record beside topic, key and message, by name. Raises StoreError where that is not of
-    its event."""
+    """The content of a record beside topic, key and message, by name. Raises StoreError where it is not of its
+    event."""
     try:
         rest = _REST[_KINDS[record.kind]]
         return dict(zip(rest, msgspec.convert(record.rest, tuple[tuple(rest.values())]), strict=True))  # type: ignore[misc]

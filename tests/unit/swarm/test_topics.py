@@ -47,13 +47,6 @@ def test_a_key_that_is_remembered_is_the_one_that_would_be_made(data, topic):
         topic.value(drawn | {"colour": "red"})
 
 
-def test_no_sender_of_ever_other_keys_makes_more_of_them_remembered_than_there_is_room_for(monkeypatch):
-    monkeypatch.setattr("swarm.wire.topics._MOST_VALUES", 3)
-    for n in range(9):
-        assert POSE.keyed("swarm", target=f"new{n}") == f"swarm/target/new{n}/pose"
-        assert len(POSE._values) <= 3
-
-
 @pytest.mark.parametrize("wrong", ["", "a/b", "a*", "$*", "**", "a b", "a?b", "a#", "\n"])
 def test_what_is_not_one_chunk_is_refused(wrong):
     with pytest.raises(ValueError, match="part of a key"):
