@@ -13,10 +13,9 @@ from __future__ import annotations
 
 import contextlib
 import logging
-import math
 import struct
 import zlib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, BinaryIO, Literal, cast
@@ -82,20 +81,21 @@ class Head(Record, frozen=True, tag=0):
     anew: bool = False
 
 
-class LoopFigures(msgspec.Struct, frozen=True, array_like=True):
-    """Counters of a process's loop, not of its service, since the last call."""
-
-    counts: dict[str, int]
-    gauges: dict[str, float]
-    buckets: dict[str, dict[int, int]]
+Figure = tuple[str, str | int, int | float]
+"""A counter of a process's loop, not of its service: `_COUNT` and its name, `_GAUGE` and its name, or a histogram
+and a bucket of it; and its value."""
+_COUNT, _GAUGE = "", "~"
 
 
 class Called(Record, frozen=True, tag=1):
-    """A call of the service's `start`, `tick` or `stop`."""
+    """A call of the service's `start`, `tick` or `stop`.
+
+    figures  those that have changed since the last such call
+    """
 
     now_ns: int
     method: Literal["start", "tick", "stop"]
-    figures: LoopFigures | None = None
+    figures: list[Figure] = []
 
 
 class Handled(Record, frozen=True, tag=2):
@@ -361,54 +361,19 @@ def event_of(record: Handled, answerer: Callable[..., Any]) -> bus.Event:
     return cast(bus.Event, kind(topic=topic, fields=fields, message=message, **rest))
 
 
-class LoopCounters(Counters):
-    """The counters of a service, for its loop: the same figures, and which of them the loop writes."""
-
-    def __init__(self, counters: Counters) -> None:
-        vars(self).update(vars(counters))  # the same, not copies
-        self._recorded = LoopFigures({}, {}, {})
-        """Counters of the loop as last recorded; a value that no counter has for those never written."""
-
-    def count(self, name: str, by: int = 1) -> None:
-        self._recorded.counts.setdefault(name, -1)
-        super().count(name, by)
-
-    def set_counts(self, counts: Mapping[str, int]) -> None:
-        for name in counts:
-            self._recorded.counts.setdefault(name, -1)
-        super().set_counts(counts)
-
-    def gauge(self, name: str, value: float) -> None:
-        self._recorded.gauges.setdefault(name, math.nan)
-        super().gauge(name, value)
-
-    def observe(self, name: str, value: float) -> None:
-        self._recorded.buckets.setdefault(name, {})
-        super().observe(name, value)
-
-    def changed(self) -> LoopFigures | None:
-        """Returns the counters that the loop has changed since the last call; None if there are none."""
-        last, gauges = self._recorded, self.gauges
-        new = LoopFigures(
-            {name: self.counts[name] for name, was in last.counts.items() if self.counts[name] != was},
-            {name: gauges[name] for name, was in last.gauges.items() if name in gauges and gauges[name] != was},
-            {},
-        )
-        for name, was in last.buckets.items():
-            found = self.histograms[name].buckets
-            if changed := {bucket: count for bucket, count in found.items() if count != was.get(bucket)}:
-                new.buckets[name] = changed
-                was.update(changed)
-        last.counts.update(new.counts)
-        last.gauges.update(new.gauges)
-        return new if new.counts or new.gauges or new.buckets else None
+def figures_of(loop: Counters) -> dict[tuple[str, str | int], int | float]:
+    """All figures of a loop, by their place."""
+    buckets = {
+        (name, bucket): count for name, each in loop.histograms.items() for bucket, count in each.buckets.items()
+    }
+    gauges = {(_GAUGE, name): value for name, value in loop.gauges.items()}
+    return {(_COUNT, name): count for name, count in loop.counts.items()} | gauges | buckets
 
 
-def set_figures(counters: Counters, figures: LoopFigures | None) -> None:
-    """Writes recorded figures into a service's counters."""
-    if figures is None:
-        return
-    counters.set_counts(figures.counts)
-    counters.gauges.update(figures.gauges)
-    for name, buckets in figures.buckets.items():
-        counters.histograms.setdefault(name, Histogram()).buckets.update(buckets)
+def set_figures(counters: Counters, figures: Iterable[Figure]) -> None:
+    """Writes figures of a loop into its service's counters."""
+    for kind, name, value in figures:
+        into: dict[Any, Any] = counters.counts if kind == _COUNT else counters.gauges
+        if kind not in (_COUNT, _GAUGE):
+            into = counters.histograms.setdefault(kind, Histogram()).buckets
+        into[name] = value
