@@ -7,9 +7,8 @@ import math
 from bisect import bisect_right
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from functools import cache, cached_property, lru_cache
+from functools import cache, cached_property
 from itertools import accumulate, pairwise
-from operator import sub
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 from msgspec import Meta
@@ -343,22 +342,9 @@ def _own_legs(routes: Sequence[Route]) -> Iterator[bytes]:
 
 def directions_of(cells: Sequence[int] | NDArray[np.int64], cols: int) -> bytes:
     """The direction code (0..7, clockwise from north) of each step between neighbouring cells, one byte each."""
-    if cols >= _TELLING_COLS and isinstance(cells, (list, tuple)):
-        return bytes(map(_codes_by_offset(cols).__getitem__, map(sub, cells[1:], cells)))
     rows, east = np.divmod(np.asarray(cells, np.int64), cols)
     codes: NDArray[np.uint8] = _codes()[np.diff(rows) + 1, np.diff(east) + 1]
     return codes.tobytes()
-
-
-_TELLING_COLS = 3
-"""In a grid of fewer columns two directions may add the same to a cell."""
-
-
-@lru_cache(maxsize=16)
-def _codes_by_offset(cols: int) -> dict[int, int]:
-    """Returns offset of a step in a grid with `columns` columns -> its direction code."""
-    offsets = zip(STEP_ROW, STEP_COL, strict=True)
-    return {south * cols + east: code for code, (south, east) in enumerate(offsets)}
 
 
 @cache
