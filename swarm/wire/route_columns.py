@@ -24,7 +24,6 @@ from swarm.wire.fields import (
     Length,
     check_column,
     np,
-    pack_column,
 )
 
 if TYPE_CHECKING:
@@ -160,30 +159,14 @@ class RouteBatch:
         return self.statuses.size
 
     def __getitem__(self, index: int) -> Route:
-        if not -len(self) <= index < len(self):
-            raise IndexError(index)
-        index %= len(self)
-        begin = self.ends[index - 1] if index else 0
-        legs = slice(*self._leg_ends[index : index + 2]) if self.legs.size else slice(0)
-        return Route(
-            status=STATUSES[self.statuses[index]],
-            start=int(self.starts[index]),
-            directions=self.directions[begin : self.ends[index]].tobytes(),
-            cost_s=float(self.cost_s[index]),
-            lower_bound_s=float(self.lower_bound_s[index]),
-            length_m=float(self.length_m[index]),
-            remaining_s=float(self.remaining_s[index]),
-            legs=pack_column(self.legs[legs], "<u4"),
-        )
-
-    @cached_property
-    def _leg_ends(self) -> list[int]:
-        """Start of each route's legs, and the end of all."""
-        ends = np.searchsorted(np.cumsum(self.legs, dtype=np.int64), self.ends, "right")
-        return [0, *ends.tolist()]
+        return self._listed[index]
 
     def __iter__(self) -> Iterator[Route]:
-        return map(self.__getitem__, range(len(self)))
+        return iter(self._listed)
+
+    @cached_property
+    def _listed(self) -> list[Route]:
+        return self.columns().listed
 
     def outlines(self) -> Iterator[RouteOutline]:
         """Returns the distinguishing fields of each route: many are compared for few that are sent."""
