@@ -243,7 +243,9 @@ class RecordReader:
         try:
             if self._file.read(len(MAGIC)) != MAGIC:
                 expected = f"expected {MAGIC.decode().strip()!r} at its beginning"
-                raise StoreError(f"{path} is no recording of this version, which reads its own: {expected}")
+                raise StoreError(
+                    f"{path} is no recording of this version: {expected}; replay it with its own version"
+                )
             self.at = len(MAGIC)
             self._records = self._read()
             head = next(self._records, None)
@@ -363,11 +365,11 @@ def event_of(record: Handled, answerer: Callable[..., Any]) -> bus.Event:
 
 def figures_of(loop: Counters) -> dict[tuple[str, str | int], int | float]:
     """All figures of a loop, by their place."""
-    buckets = {
-        (name, bucket): count for name, each in loop.histograms.items() for bucket, count in each.buckets.items()
-    }
-    gauges = {(_GAUGE, name): value for name, value in loop.gauges.items()}
-    return {(_COUNT, name): count for name, count in loop.counts.items()} | gauges | buckets
+    found: dict[tuple[str, str | int], int | float] = {(_COUNT, name): count for name, count in loop.counts.items()}
+    found.update(((_GAUGE, name), value) for name, value in loop.gauges.items())
+    for name, each in loop.histograms.items():
+        found.update(((name, bucket), count) for bucket, count in each.buckets.items())
+    return found
 
 
 def set_figures(counters: Counters, figures: Iterable[Figure]) -> None:
