@@ -17,7 +17,7 @@ import numpy as np
 from shared_map.array_files import Floats
 from shared_map.replication.interest import MarkFilter
 from swarm.clock import NS_PER_S
-from swarm.peers import POSE_SILENCE_NS, Leases
+from swarm.peers import POSE_SILENCE_NS
 from swarm.wire.fields import LONGEST_LEASE_S
 from swarm.wire.messages.planning import Sighted, TargetPose
 from swarm.wire.messages.vehicles import Fleet
@@ -112,30 +112,27 @@ class Presence:
 
     def __init__(self, lease_ns: int, filter: MarkFilter | None = None) -> None:
         self._filter = filter
-        self._leases = Leases(lease_ns)
-        self._newest: dict[str, Fleet] = {}
+        self._lease_ns = lease_ns
+        self._newest: dict[tuple[str, int], tuple[Fleet, int]] = {}
+        """(author, region) -> its newest message, and when that came."""
 
     def receive(self, fleet: Fleet, now_ns: int) -> None:
         """Takes in a message; late and repeated ones change nothing."""
         if self._filter is not None and not self._filter.accepts_author(fleet.author, fleet.group):
             return
-        key = f"{fleet.author}/{fleet.region}"
-        known = self._newest.get(key)
-        if known is not None and fleet.seq <= known.seq:
-            return
-        self._leases.renew(key, now_ns)
-        self._newest[key] = fleet
+        key = fleet.author, fleet.region
+        if key not in self._newest or fleet.seq > self._newest[key][0].seq:
+            self._newest[key] = fleet, now_ns
 
     def expire(self, now_ns: int) -> None:
         """Forgets messages whose lease has ended."""
-        for key in self._leases.expired(now_ns):
-            del self._newest[key]
+        self._newest = {key: each for key, each in self._newest.items() if now_ns - each[1] <= self._lease_ns}
 
     def places(self) -> dict[str, tuple[float, float]]:
         """Vehicle -> (east_m, south_m) from the grid's west and north border. If messages about two regions list a
         vehicle, which crosses a border, the newer one counts."""
         found: dict[str, tuple[float, float]] = {}
-        for fleet in sorted(self._newest.values(), key=lambda each: each.stamp_ns):
+        for fleet, _ in sorted(self._newest.values(), key=lambda each: each[0].stamp_ns):
             east_m, south_m = np.frombuffer(fleet.east_m, "<f4"), np.frombuffer(fleet.south_m, "<f4")
             found |= zip(fleet.ids, zip(east_m.tolist(), south_m.tolist(), strict=True), strict=True)
         return found

@@ -105,26 +105,6 @@ class Newest:
         return True
 
 
-class Leases:
-    """Time when each key was last heard of. `expired` forgets keys that have been silent for longer than the
-    lease."""
-
-    def __init__(self, lease_ns: int) -> None:
-        self._lease_ns = lease_ns
-        self._heard_ns: dict[str, int] = {}
-
-    def renew(self, key: str, now_ns: int) -> None:
-        """Renew the lease of a key."""
-        self._heard_ns[key] = now_ns
-
-    def expired(self, now_ns: int) -> list[str]:
-        """The keys whose lease has run out since the last call, in the order in which they were first heard."""
-        late = [key for key, heard_ns in self._heard_ns.items() if now_ns - heard_ns > self._lease_ns]
-        for key in late:
-            del self._heard_ns[key]
-        return late
-
-
 HIGHEST_RANK = 9
 """One digit in an id. A job with nine standbys is on more machines than may fail together."""
 _RANKED = re.compile(rf"(.+)\.r([1-{HIGHEST_RANK}])")

@@ -21,7 +21,7 @@ from swarm.bus import bus
 from swarm.config.explain import meanings
 from swarm.wire import codec, topics
 from swarm.wire.access import MEMBERS, MEMBERS_OWN, OPERATOR, Grant
-from swarm.wire.fields import Characters, Column, taken_apart
+from swarm.wire.fields import Column, taken_apart
 from swarm.wire.messages import WIRE_VERSION, Message
 from swarm.wire.messages.map_data import SEQ_STEP, MarkKind
 from swarm.wire.messages.vehicles import VehicleState
@@ -158,7 +158,7 @@ def type_text(hint: Any) -> str:
 def _bounded(bare: Any, notes: tuple[Any, ...]) -> str:
     """A type with all that its annotation says of bounds."""
     words = type_text(bare)
-    if any(isinstance(note, Characters) for note in notes):
+    if any(isinstance(note, msgspec.Meta) and note.pattern for note in notes):
         return "id"
     for column in (note for note in notes if isinstance(note, Column)):
         words = column.describe() + _range(column.least, column.most)

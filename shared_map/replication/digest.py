@@ -4,10 +4,9 @@ received digests that still have to be compared with the held sets (`PendingDige
 from __future__ import annotations
 
 import hashlib
-from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import dataclass
-from itertools import islice
+from dataclasses import dataclass, field
+from itertools import chain, islice, zip_longest
 
 import numpy as np
 from numpy.typing import NDArray
@@ -193,10 +192,6 @@ _ROWS = 16
 """Rows of a digest that count as one unit of the work of a tick."""
 
 
-_LAST = (1 << 62, 0)
-"""Default for senders that were forgotten."""
-
-
 @dataclass(slots=True)
 class PendingDigest:
     """A digest that waits for its comparison.
@@ -221,6 +216,15 @@ class PendingDigest:
         return len(self.digest.held) + rows // _ROWS + 1
 
 
+@dataclass(slots=True)
+class _Sender:
+    """A sender and its newest digests, by what they cover: one of late changes does not replace the last whole
+    one."""
+
+    heard_ns: int = 0
+    pending: dict[tuple[bool, Place | None], PendingDigest] = field(default_factory=dict)
+
+
 class PendingDigests:
     """The newest digest of each sender until nothing that it names is missing. Bounded in senders and bytes.
 
@@ -228,84 +232,65 @@ class PendingDigests:
     """
 
     def __init__(self) -> None:
-        # By sender and what it covers: a digest of late changes does not replace the last whole one.
-        self._pending: dict[tuple[str, bool, Place | None], PendingDigest] = {}
-        self._of = Counter[str]()  # sender -> how many of these are its
+        self._senders: dict[str, _Sender] = {}  # in order of appearance
         self._bytes = 0  # sum of `size` of what is pending
         self._newest = Newest(_MAX_SENDERS)  # of the digests whose senders count them
-        self._senders: dict[str, tuple[int, int]] = {}  # sender -> its number in order of appearance, when heard
-        self._appeared = 0  # the last of these numbers
         self._forget_due_ns = 0
 
     def add(self, digest: Digest, now_ns: int) -> bool:
         """Takes in a digest; false if a newer one of its sender overtook it, or if there is no space for it."""
-        sender, stream = digest.author, _stream(digest)
-        if digest.seq and not self._newest.is_news(stream, (0, digest.seq), now_ns):
+        stream = digest.whole, digest.after
+        if digest.seq and not self._newest.is_news((digest.author, *stream), (0, digest.seq), now_ns):
             return False
-        if not self._knows(sender, now_ns):
+        sender = self._sender(digest.author, now_ns)
+        if sender is None:
             return False
-        due_ns = now_ns + _GRACE_NS
-        replaced = self._pending.get(stream)
-        if replaced is not None:
-            due_ns = min(replaced.due_ns, due_ns)
-            self._drop(replaced)
-        new = PendingDigest(digest, due_ns)
-        if self._bytes + new.size <= _MAX_BYTES and self._of[sender] < _MAX_PARTS:
-            self._pending[stream] = new
-            self._of[sender] += 1
+        new = PendingDigest(digest, now_ns + _GRACE_NS)
+        if (replaced := sender.pending.pop(stream, None)) is not None:
+            new.due_ns = min(replaced.due_ns, new.due_ns)
+            self._bytes -= replaced.size
+        if self._bytes + new.size <= _MAX_BYTES and len(sender.pending) < _MAX_PARTS:
+            sender.pending[stream] = new
             self._bytes += new.size
         return True
 
-    def _knows(self, sender: str, now_ns: int) -> bool:
-        """Registers a sender. Returns False if there is no room."""
-        known = self._senders.get(sender)
-        if known is None:
+    def _sender(self, name: str, now_ns: int) -> _Sender | None:
+        """A sender that is heard now; None if there is no room for it."""
+        if name not in self._senders:
             if len(self._senders) >= _MAX_SENDERS and now_ns >= self._forget_due_ns:
                 self._forget_due_ns = now_ns + NS_PER_S
-                senders = self._senders.items()
-                self._senders = {name: of for name, of in senders if now_ns - of[1] < _FORGET_NS}
+                self._senders = {
+                    each: of for each, of in self._senders.items() if now_ns - of.heard_ns < _FORGET_NS
+                }
+                self._bytes = sum(each.size for of in self._senders.values() for each in of.pending.values())
             if len(self._senders) >= _MAX_SENDERS:
-                return False
-            self._appeared += 1
-        self._senders[sender] = (self._appeared if known is None else known[0], now_ns)
-        return True
+                return None
+            self._senders[name] = _Sender()
+        self._senders[name].heard_ns = now_ns
+        return self._senders[name]
 
     def due(self, now_ns: int) -> Iterator[PendingDigest]:
         """Those to compare in this tick."""
-        turns: list[tuple[int, int, PendingDigest]] = []
-        taken = Counter[str]()
-        for (sender, *_), each in self._pending.items():
-            if now_ns >= each.due_ns:
-                turns.append((taken[sender], self._senders.get(sender, _LAST)[0], each))
-                taken[sender] += 1
+        ready = ([each for each in of.pending.values() if now_ns >= each.due_ns] for of in self._senders.values())
         left = _AT_ONCE
-        for _, _, each in sorted(turns, key=lambda turn: turn[:2]):
+        for each in chain.from_iterable(zip_longest(*ready)):
             if left <= 0:
-                break
-            left -= each.cost
-            yield each
+                return
+            if each is not None:
+                left -= each.cost
+                yield each
 
     def compared(self, pending: PendingDigest, complete: bool, now_ns: int) -> None:
         """Notes a comparison: a digest is done if all of its sets are held, else due again, at most ten times."""
         pending.tries += 1
+        pending.due_ns = now_ns + _RETRY_NS
         if complete or pending.tries > _MAX_TRIES:
-            self._drop(pending)
-        else:
-            pending.due_ns = now_ns + _RETRY_NS
+            digest = pending.digest
+            del self._senders[digest.author].pending[digest.whole, digest.after]
+            self._bytes -= pending.size
 
     def hasten(self, now_ns: int) -> None:
         """Compares all of them at once: a link has come back."""
-        for pending in self._pending.values():
-            pending.due_ns = now_ns
-
-    def _drop(self, pending: PendingDigest) -> None:
-        del self._pending[_stream(pending.digest)]
-        self._of[pending.digest.author] -= 1
-        if not self._of[pending.digest.author]:
-            del self._of[pending.digest.author]
-        self._bytes -= pending.size
-
-
-def _stream(digest: Digest) -> tuple[str, bool, Place | None]:
-    """The digests of which only the newest counts."""
-    return digest.author, digest.whole, digest.after
+        for of in self._senders.values():
+            for pending in of.pending.values():
+                pending.due_ns = now_ns

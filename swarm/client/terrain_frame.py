@@ -46,11 +46,7 @@ class Frame:
         """The cell at a place. Raises ConfigError on a location outside the terrain and on a value that is not a
         number."""
         grid, x_m, y_m = self.grid, real("x_m", x_m), real("y_m", y_m)
-        if not (math.isfinite(x_m) and math.isfinite(y_m)):
-            raise ConfigError(f"x_m {x_m!r}, y_m {y_m!r} is no place: both must be finite numbers of metres")
-        row = math.floor((grid.north_m - y_m) / grid.resolution_m)
-        col = math.floor((x_m - grid.west_m) / grid.resolution_m)
-        if not grid.inside(row, col):
+        if (cell := grid.cell_at(x_m, y_m)) < 0:
             east_m = grid.west_m + grid.cols * grid.resolution_m
             south_m = grid.north_m - grid.rows * grid.resolution_m
             crs = shorten(self.crs, 40, placeholder=" ...")
@@ -58,7 +54,7 @@ class Frame:
                 f"x_m {x_m:.10g}, y_m {y_m:.10g} is outside the terrain, which has x_m {grid.west_m:.10g} ... "
                 f"{east_m:.10g} and y_m {south_m:.10g} ... {grid.north_m:.10g} in {crs}"
             )
-        return grid.cell(row, col)
+        return cell
 
     def cell_named(self, place: Given) -> int:
         """The cell of a place as commands and scenarios have it: `"48.27,9.44"` (latitude, longitude), `"xy:X,Y"`

@@ -9,7 +9,7 @@ from hashlib import blake2b
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from platform import python_version
-from typing import Any, TypeVar
+from typing import Any, Literal, TypeVar
 
 from swarm.bus.bus import Asked, Bus, Event, Post, WorkDone, Worker
 from swarm.bus.zenoh_bus import open_bus
@@ -174,18 +174,25 @@ class _RecordedService:
     def __init__(self, service: Service, recording: Recording) -> None:
         self._service = service
         self._recording = recording
-        self._counters = recording_file.LoopCounters(service.counters)
+        self._loop, self._told = Counters(), dict[tuple[str, str | int], int | float]()
 
     @property
     def counters(self) -> Counters:
-        return self._counters
+        return self._loop
 
     def lacks(self) -> Sequence[str]:
         return self._service.lacks()
 
+    def _call(self, method: Literal["start", "tick", "stop"], now_ns: int) -> None:
+        """Tells the service the figures of its loop, as a replay does, and calls it."""
+        before, self._told = self._told, recording_file.figures_of(self._loop)
+        changed = [(*at, value) for at, value in self._told.items() if before.get(at) != value]
+        recording_file.set_figures(self._service.counters, changed)
+        with self._recording.call(recording_file.Called(now_ns, method, changed)):
+            getattr(self._service, method)(now_ns)
+
     def start(self, now_ns: int) -> None:
-        with self._recording.call(recording_file.Called(now_ns, "start", self._counters.changed())):
-            self._service.start(now_ns)
+        self._call("start", now_ns)
 
     def handle(self, event: Event, now_ns: int) -> None:
         record = recording_file.record_of(event, now_ns)
@@ -195,12 +202,10 @@ class _RecordedService:
             self._service.handle(event, now_ns)
 
     def tick(self, now_ns: int) -> None:
-        with self._recording.call(recording_file.Called(now_ns, "tick", self._counters.changed())):
-            self._service.tick(now_ns)
+        self._call("tick", now_ns)
 
     def stop(self, now_ns: int) -> None:
-        with self._recording.call(recording_file.Called(now_ns, "stop", self._counters.changed())):
-            self._service.stop(now_ns)
+        self._call("stop", now_ns)
 
 
 @contextmanager

@@ -1,9 +1,9 @@
-"""A recording as a file: blocks behind each other, each with its length and checksum, of compressed records.
+"""A recording as a file: blocks behind each other, each a compressed list of records.
 
-    "swarm recording 2\n" {length u32, crc32 u32, zlib({length u32, record} {length, record} ...)} ...
+    "swarm recording 3\n" {length u32, zlib([record, record, ...])} ...
 
-Records are MessagePack, numbers little-endian. A process that is killed leaves a file that can be read up to its
-last whole block. Reading a file raises nothing but StoreError, whatever its content.
+Records are MessagePack, numbers little-endian; zlib has a checksum. A process that is killed leaves a file that can
+be read up to its last whole block. Reading a file raises nothing but StoreError, whatever its content.
 
 The calls into a service become records, and back: events of the bus, and the loop's counters, which the service
 publishes.
@@ -13,13 +13,12 @@ from __future__ import annotations
 
 import contextlib
 import logging
-import math
 import struct
 import zlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, BinaryIO, Literal
+from typing import Annotated, Any, BinaryIO, Literal, cast
 
 import msgspec
 
@@ -30,12 +29,12 @@ from swarm.errors import ProtocolError, StoreError
 from swarm.peers import Peer
 from swarm.recording.service_boundary import content_of
 from swarm.runtime.stats import Counters, Histogram
-from swarm.wire.codec import decode, decode_either
+from swarm.wire.codec import decode_either
 from swarm.wire.topics import TOPICS
 
 log = logging.getLogger(__name__)
 
-MAGIC = b"swarm recording 2\n"
+MAGIC = b"swarm recording 3\n"
 SUFFIX = ".inputs"
 FOLDER = "inputs"
 """Folder in a run's folder: one recording per start of a process."""
@@ -47,7 +46,6 @@ _LONGEST_BLOCK_BYTES = 256 << 20
 """A block is taken to hold no more, whatever it says."""
 _LEVEL = 1
 """Compression level, the fastest: it leaves a third to a quarter of the bytes."""
-_HEAD = struct.Struct("<II")
 _LENGTH = struct.Struct("<I")
 
 
@@ -83,20 +81,21 @@ class Head(Record, frozen=True, tag=0):
     anew: bool = False
 
 
-class LoopFigures(msgspec.Struct, frozen=True, array_like=True):
-    """Counters of a process's loop, not of its service, since the last call."""
-
-    counts: dict[str, int]
-    gauges: dict[str, float]
-    buckets: dict[str, dict[int, int]]
+Figure = tuple[str, str | int, int | float]
+"""A counter of a process's loop, not of its service: `_COUNT` and its name, `_GAUGE` and its name, or a histogram
+and a bucket of it; and its value."""
+_COUNT, _GAUGE = "", "~"
 
 
 class Called(Record, frozen=True, tag=1):
-    """A call of the service's `start`, `tick` or `stop`."""
+    """A call of the service's `start`, `tick` or `stop`.
+
+    figures  those that have changed since the last such call
+    """
 
     now_ns: int
     method: Literal["start", "tick", "stop"]
-    figures: LoopFigures | None = None
+    figures: list[Figure] = []
 
 
 class Handled(Record, frozen=True, tag=2):
@@ -105,15 +104,15 @@ class Handled(Record, frozen=True, tag=2):
     kind     the name of its class in `swarm.bus.bus`
     topic    its name; empty of an event that has none
     chunks   of the key, in the order of the topic's fields
-    samples  ("", payload) of its message, if it has one
-    rest     the other fields of the event
+    payload  of its message, if it has one
+    rest     the other fields of the event, as `_REST` has them
     """
 
     now_ns: int
     kind: str
     topic: str = ""
     chunks: list[str] = []
-    samples: list[tuple[str, bytes]] = []
+    payload: bytes = b""
     rest: tuple[Any, ...] = ()
 
 
@@ -153,32 +152,25 @@ Call = Called | Handled
 AnyRecord = Head | Call | Read | Outputs | Cut | Ended
 
 _encode = msgspec.msgpack.Encoder().encode
-_decoder: msgspec.msgpack.Decoder[Any] = msgspec.msgpack.Decoder(AnyRecord)
+_decoder = msgspec.msgpack.Decoder(list[AnyRecord])
 
 
-def packed(*records: Record) -> bytes:
+def packed(*records: Record | msgspec.Raw) -> bytes:
     """Records as they stand in the file: in a block of their own."""
-    return _block(b"".join(_LENGTH.pack(len(body)) + body for body in map(_encode, records)))
-
-
-def _block(content: bytes | bytearray) -> bytes:
-    body = zlib.compress(content, _LEVEL)
-    return _HEAD.pack(len(body), zlib.crc32(body)) + body
+    body = zlib.compress(_encode(records), _LEVEL)
+    return _LENGTH.pack(len(body)) + body
 
 
 class RecordWriter:
-    """Appends records to a file of its own. A full disk, or `MOST_BYTES`, cut the recording, not the process.
-
-    cut  why it does not go on; None while it does
-    """
+    """Appends records to a file of its own. A full disk, or `MOST_BYTES`, cut the recording, not the process."""
 
     def __init__(self, path: Path, most_bytes: int = MOST_BYTES) -> None:
         self.path = path
-        self.cut: str | None = None
         self._most_bytes = most_bytes
         self._bytes = 0
-        self._waiting = bytearray()
-        """Records of the next block."""
+        self._waiting: list[msgspec.Raw] = []
+        """Records of the next block, and below their bytes."""
+        self._waiting_bytes = 0
         self._file: BinaryIO | None = None
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
@@ -191,17 +183,17 @@ class RecordWriter:
         if self._file is None:
             return
         body = _encode(record)
-        self._waiting += _LENGTH.pack(len(body))
-        self._waiting += body
-        if len(self._waiting) >= _BLOCK_BYTES:
+        self._waiting.append(msgspec.Raw(body))
+        self._waiting_bytes += len(body)
+        if self._waiting_bytes >= _BLOCK_BYTES:
             self.flush()
 
     def flush(self) -> None:
         """Hands the waiting records over to the system."""
         if self._file is None or not self._waiting:
             return
-        block = _block(self._waiting)
-        self._waiting = bytearray()
+        block = packed(*self._waiting)
+        self._waiting, self._waiting_bytes = [], 0
         try:
             if self._bytes + len(block) > self._most_bytes:
                 why = f"a recording takes {self._most_bytes >> 20} MiB at most"
@@ -226,8 +218,7 @@ class RecordWriter:
         self._bytes += len(content)
 
     def _end(self, why: str) -> None:
-        self.cut = why
-        self._waiting = bytearray()
+        self._waiting = []
         self.close()
         log.warning("inputs are not recorded any more: %s", why)
 
@@ -238,14 +229,12 @@ class RecordReader:
     head     its first record
     at       how many of its bytes are read
     damaged  why it cannot be read further, in a sentence; None until that is found
-    torn     True if the file ends within a block, as after a kill; known once all records have been read
     """
 
     def __init__(self, path: Path) -> None:
         self.path = path
         self.at = 0
         self.damaged: str | None = None
-        self.torn = False
         try:
             check_bytes(path, FileKind.RECORDING)
             self._file = path.open("rb")
@@ -253,7 +242,10 @@ class RecordReader:
             raise StoreError(f"cannot read recording {path}: {error.strerror or error}") from error
         try:
             if self._file.read(len(MAGIC)) != MAGIC:
-                raise StoreError(f"{path} is no recording: it does not begin with {MAGIC.decode().strip()!r}")
+                expected = f"expected {MAGIC.decode().strip()!r} at its beginning"
+                raise StoreError(
+                    f"{path} is no recording of this version: {expected}; replay it with its own version"
+                )
             self.at = len(MAGIC)
             self._records = self._read()
             head = next(self._records, None)
@@ -277,52 +269,23 @@ class RecordReader:
     def _read(self) -> Iterator[AnyRecord]:
         try:
             while (block := self._next_block()) is not None:
-                start = 0
-                while start < len(block):
-                    (length,) = _LENGTH.unpack_from(block, start)
-                    start += _LENGTH.size + length
-                    if start > len(block):
-                        raise ValueError("a record is longer than its block")
-                    record: AnyRecord = _decoder.decode(block[start - length : start])
-                    yield record
-        except (OSError, ValueError, RecursionError, struct.error, zlib.error, msgspec.MsgspecError) as error:
+                yield from _decoder.decode(block)
+        except (OSError, ValueError, RecursionError, zlib.error, msgspec.MsgspecError) as error:
             self.damaged = f"damaged at byte {self.at}: {error}"
 
     def _next_block(self) -> bytes | None:
-        """The records of the next block; None if there is no whole one."""
-        head = self._file.read(_HEAD.size)
-        if len(head) < _HEAD.size:
-            self.torn = len(head) > 0
+        """The records of the next block; None if there is no whole one, as after a kill."""
+        head = self._file.read(_LENGTH.size)
+        length = _LENGTH.unpack(head)[0] if len(head) == _LENGTH.size else 0
+        body = self._file.read(min(length, FileKind.RECORDING.most_bytes))
+        if not length or len(body) < length:
             return None
-        length, checksum = _HEAD.unpack(head)
-        if length > FileKind.RECORDING.most_bytes:
-            raise ValueError(f"a block of {length} bytes")
-        body = self._file.read(length)
-        if len(body) < length:
-            self.torn = True
-            return None
-        if zlib.crc32(body) != checksum:
-            raise ValueError("a block does not match its checksum")
         content = zlib.decompressobj()
         block = content.decompress(body, _LONGEST_BLOCK_BYTES)
-        if content.unconsumed_tail:
-            raise ValueError(f"a block of more than {_LONGEST_BLOCK_BYTES} bytes")
+        if not content.eof or content.unused_data:
+            raise ValueError(f"a block that has no end where it says, or more than {_LONGEST_BLOCK_BYTES} bytes")
         self.at += len(head) + length
         return block
-
-
-_TOPICS = {topic.name: topic for topic in TOPICS}
-_REST: dict[str, Any] = {
-    "Heard": tuple[()],
-    "Asked": tuple[float],
-    "Replied": tuple[str, float],
-    "AskEnded": tuple[str, int, str | None],
-    "Appeared": tuple[str, str, int],
-    "Disappeared": tuple[str, str, int],
-    "LinkChanged": tuple[bool, bool],
-    "JobDone": tuple[str, int, int, list[tuple[str, bytes]]],
-}
-"""Class of an event -> types of what its record holds beside topic, key and messages."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -333,126 +296,86 @@ class JobDone(bus.WorkDone):
     reads: Sequence[tuple[str, bytes]]
 
 
+_TOPICS = {topic.name: topic for topic in TOPICS}
+_REST: dict[type, dict[str, Any]] = {
+    bus.Heard: {},
+    bus.Asked: {"timeout_s": float},
+    bus.Replied: {"tag": str, "took_s": float},
+    bus.AskEnded: {"tag": str, "replies": int, "failure": str | None},
+    bus.Appeared: {"peer": Peer},
+    bus.Disappeared: {"peer": Peer},
+    bus.LinkChanged: {"up": bool, "beyond": bool},
+    JobDone: {"tag": str, "number": int, "took_ns": int, "reads": list[tuple[str, bytes]]},
+}
+"""Class of an event -> what its record holds beside topic, key and message, and of which type."""
+_KINDS = {kind.__name__: kind for kind in _REST}
+
+
 def record_of(event: bus.Event, now_ns: int) -> Handled:
     """The record of an event that is handled now."""
-    samples: list[tuple[str, bytes]] = []
-    rest: tuple[Any, ...] = ()
-    match event:
-        case bus.Heard(message=message):
-            samples = [("", content_of(message))]
-        case bus.Asked(request=message):
-            samples, rest = [("", content_of(message))], (event.timeout_s,)
-        case bus.Replied(message=message):
-            samples, rest = [("", content_of(message))], (event.tag, event.took_s)
-        case bus.AskEnded():
-            rest = (event.tag, event.replies, event.failure)
-        case bus.Appeared(peer) | bus.Disappeared(peer):
-            rest = (peer.role, peer.id, peer.incarnation)
-        case bus.LinkChanged():
-            rest = (event.up, event.beyond)
-        case JobDone():
-            rest = (event.tag, event.number, event.took_ns, list(event.reads))
-        case _:
-            raise TypeError(f"an event that no boundary has passed: {event!r}")
-    topic, fields = getattr(event, "topic", None), getattr(event, "fields", None)
-    chunks = [fields[name] for name in topic.fields] if topic is not None and fields is not None else []
-    return Handled(now_ns, type(event).__name__, "" if topic is None else topic.name, chunks, samples, rest)
+    kind, topic, fields = type(event), getattr(event, "topic", None), getattr(event, "fields", None)
+    if kind not in _REST:
+        raise TypeError(f"an event that no boundary has passed: {event!r}")
+    message = getattr(event, "request", None) or getattr(event, "message", None)
+    return Handled(
+        now_ns,
+        kind.__name__,
+        "" if topic is None else topic.name,
+        [] if topic is None or fields is None else [fields[name] for name in topic.fields],
+        b"" if message is None else content_of(message),
+        tuple(getattr(event, name) for name in _REST[kind]),
+    )
 
 
-def rest_of(record: Handled) -> Any:
-    """Returns the content of a record beside topic, key and messages. Raises StoreError where that is not of its
+def rest_of(record: Handled) -> dict[str, Any]:
+    """The content of a record beside topic, key and message, by name. Raises StoreError where it is not of its
     event."""
     try:
-        return msgspec.convert(record.rest, _REST[record.kind])
+        rest = _REST[_KINDS[record.kind]]
+        return dict(zip(rest, msgspec.convert(record.rest, tuple[tuple(rest.values())]), strict=True))  # type: ignore[misc]
     except (KeyError, msgspec.ValidationError) as error:
         raise StoreError(f"a record that is no event: {error}") from error
 
 
-def event_of(record: Handled, answerer: bus.Answerer) -> bus.Event:
+def event_of(record: Handled, answerer: Callable[..., Any]) -> bus.Event:
     """The event in a record, but for jobs. Raises StoreError on one that cannot have been an event.
 
-    answerer  receives the replies to the query
+    answerer  makes what receives the replies to a query, of its `timeout_s`
     """
-    rest = rest_of(record)
-    match record.kind:
-        case "Appeared":
-            return bus.Appeared(Peer(*rest))
-        case "Disappeared":
-            return bus.Disappeared(Peer(*rest))
-        case "LinkChanged":
-            return bus.LinkChanged(*rest)
-    if record.topic not in _TOPICS:
+    rest, kind = rest_of(record), _KINDS[record.kind]
+    if kind in (bus.Appeared, bus.Disappeared, bus.LinkChanged):
+        return cast(bus.Event, kind(**rest))
+    topic = _TOPICS.get(record.topic)
+    if topic is None:
         raise StoreError(f"this build has no topic {record.topic!r}")
-    topic = _TOPICS[record.topic]
-    if record.kind in ("Heard", "Asked", "Replied") and len(record.chunks) != len(topic.fields):
-        raise StoreError(f"topic {topic.name} has {len(topic.fields)} fields, not {len(record.chunks)}")
-    fields = dict(zip(topic.fields, record.chunks, strict=False))
-    payloads = [payload for _, payload in record.samples]
+    if kind is bus.AskEnded:
+        return bus.AskEnded(topic=topic, **rest)
+    wanted = topic.request if kind is bus.Asked else topic.message
+    if wanted is None or len(record.chunks) != len(topic.fields):
+        raise StoreError(f"a record of {record.kind} with {record.chunks} on topic {topic.name} that is no event")
+    fields = dict(zip(topic.fields, record.chunks, strict=True))
     try:
-        match record.kind, payloads:
-            case "Heard", [payload]:
-                return bus.Heard(topic, fields, decode(payload, topic.message))
-            case "Asked", [payload] if topic.request is not None:
-                return bus.Asked(topic, fields, decode(payload, topic.request), answerer)
-            case "Replied", [payload]:
-                tag, took_s = rest
-                return bus.Replied(tag, topic, fields, decode_either(payload, topic.message, topic.bulk), took_s)
-            case "AskEnded", _:
-                tag, replies, failure = rest
-                return bus.AskEnded(tag, topic, replies, failure)
+        message = decode_either(record.payload, wanted, topic.bulk if kind is bus.Replied else None)
     except ProtocolError as error:
         raise StoreError(f"a recorded message is none to this build: {error}") from error
-    raise StoreError(f"a record of {record.kind} on topic {topic.name} that is no event")
+    if kind is bus.Asked:
+        return bus.Asked(topic, fields, message, answerer(**rest))
+    return cast(bus.Event, kind(topic=topic, fields=fields, message=message, **rest))
 
 
-class LoopCounters(Counters):
-    """The counters of a service, for its loop: the same figures, and which of them the loop writes."""
-
-    def __init__(self, counters: Counters) -> None:
-        vars(self).update(vars(counters))  # the same, not copies
-        self._recorded = LoopFigures({}, {}, {})
-        """Counters of the loop as last recorded; a value that no counter has for those never written."""
-
-    def count(self, name: str, by: int = 1) -> None:
-        self._recorded.counts.setdefault(name, -1)
-        super().count(name, by)
-
-    def set_counts(self, counts: Mapping[str, int]) -> None:
-        for name in counts:
-            self._recorded.counts.setdefault(name, -1)
-        super().set_counts(counts)
-
-    def gauge(self, name: str, value: float) -> None:
-        self._recorded.gauges.setdefault(name, math.nan)
-        super().gauge(name, value)
-
-    def observe(self, name: str, value: float) -> None:
-        self._recorded.buckets.setdefault(name, {})
-        super().observe(name, value)
-
-    def changed(self) -> LoopFigures | None:
-        """Returns the counters that the loop has changed since the last call; None if there are none."""
-        last, gauges = self._recorded, self.gauges
-        new = LoopFigures(
-            {name: self.counts[name] for name, was in last.counts.items() if self.counts[name] != was},
-            {name: gauges[name] for name, was in last.gauges.items() if name in gauges and gauges[name] != was},
-            {},
-        )
-        for name, was in last.buckets.items():
-            found = self.histograms[name].buckets
-            if changed := {bucket: count for bucket, count in found.items() if count != was.get(bucket)}:
-                new.buckets[name] = changed
-                was.update(changed)
-        last.counts.update(new.counts)
-        last.gauges.update(new.gauges)
-        return new if new.counts or new.gauges or new.buckets else None
+def figures_of(loop: Counters) -> dict[tuple[str, str | int], int | float]:
+    """All figures of a loop, by their place."""
+    found: dict[tuple[str, str | int], int | float] = {(_COUNT, name): count for name, count in loop.counts.items()}
+    found.update(((_GAUGE, name), value) for name, value in loop.gauges.items())
+    for name, each in loop.histograms.items():
+        found.update(((name, bucket), count) for bucket, count in each.buckets.items())
+    return found
 
 
-def set_figures(counters: Counters, figures: LoopFigures | None) -> None:
-    """Writes recorded figures into a service's counters."""
-    if figures is None:
-        return
-    counters.set_counts(figures.counts)
-    counters.gauges.update(figures.gauges)
-    for name, buckets in figures.buckets.items():
-        counters.histograms.setdefault(name, Histogram()).buckets.update(buckets)
+def set_figures(counters: Counters, figures: Iterable[Figure]) -> None:
+    """Writes figures of a loop into its service's counters."""
+    for kind, name, value in figures:
+        into: dict[Any, Any] = counters.counts if kind == _COUNT else counters.gauges
+        if kind not in (_COUNT, _GAUGE):
+            into = counters.histograms.setdefault(kind, Histogram()).buckets
+        into[name] = value

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from itertools import zip_longest
-from typing import Any, TypeVar, cast
+from typing import Any, TypeVar
 
-from swarm.bus.bus import Answerer, Asked, Event, Heard, Post, WorkDone, Worker
+from swarm.bus.bus import Asked, Event, Heard, Post, WorkDone, Worker
 from swarm.clock import NS_PER_S
 from swarm.errors import StoreError
 from swarm.recording import recording_file
@@ -124,24 +124,21 @@ class Replaying(Crossing):
     def event_of(self, record: recording_file.Handled) -> Event:
         """The event in a record. A job that has ended is run now, with what it read then."""
         if record.kind == "JobDone":
-            return self._job_done(*recording_file.rest_of(record))
-        event = recording_file.event_of(record, _nobody_asks)
-        if isinstance(event, Asked):
-            (timeout_s,) = record.rest
-            return self.asked(replace(event, answerer=cast(Answerer, _Nobody(timeout_s=timeout_s))))
-        return event
+            return self._job_done(**recording_file.rest_of(record))
+        event = recording_file.event_of(record, _Nobody)
+        return self.asked(event) if isinstance(event, Asked) else event
 
-    def _job_done(self, tag: str, number: int, took_ns: int, read: list[tuple[str, bytes]]) -> WorkDone:
+    def _job_done(self, tag: str, number: int, took_ns: int, reads: list[tuple[str, bytes]]) -> WorkDone:
         job = self._jobs.pop(number, None)
         if job is None:
             raise _NotRecorded(f"result of job {number}, which this build has not begun")
-        reads, self.reads = self.reads, deque(read)
+        before, self.reads = self.reads, deque(reads)
         self._in_job = True
         try:
             return WorkDone(tag, job(), took_ns)
         finally:
             self._in_job = False
-            self.reads = reads
+            self.reads = before
 
 
 def replay(
@@ -257,9 +254,8 @@ def described(call: recording_file.Call) -> str:
     if isinstance(call, recording_file.Called):
         return call.method
     if call.kind == "JobDone":
-        tag, number, *_ = recording_file.rest_of(call)
-        return f"end of job {number} {tag}"
-    match recording_file.event_of(call, _nobody_asks):
+        return "end of job {number} {tag}".format_map(recording_file.rest_of(call))
+    match recording_file.event_of(call, _Nobody):
         case Heard(topic=topic, fields=fields):
             return topic.below(fields)
         case Asked(topic=topic, fields=fields):
@@ -290,6 +286,3 @@ class _Nobody:
 
     def __getattr__(self, name: str) -> Callable[..., None]:
         return lambda *_, **__: None
-
-
-_nobody_asks = cast(Answerer, _Nobody(timeout_s=0.0))

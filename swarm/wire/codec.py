@@ -28,7 +28,18 @@ import msgspec
 
 from swarm.errors import ProtocolError
 from swarm.grid import STEP_COL, STEP_ROW
-from swarm.wire.fields import CODES, OR_INFINITE, Column, Directions, name_of, np, numpy_loaded, taken_apart
+from swarm.wire.fields import (
+    CODES,
+    ID_PATTERN,
+    ID_WORDS,
+    OR_INFINITE,
+    Column,
+    Directions,
+    name_of,
+    np,
+    numpy_loaded,
+    taken_apart,
+)
 from swarm.wire.messages import Message
 from swarm.wire.messages.map_data import MarkSet, faulty_sets
 from swarm.wire.messages.planning import PlaceRouteReply, RouteReply
@@ -203,6 +214,7 @@ def field_fault(error: Exception, fields: Mapping[Any, Any], message_type: type[
 
 def _in_words(said: str) -> str:
     """Returns what msgspec expected, such as "Expected `int | null` >= 0, got `str`", without names of types."""
+    said = said.replace(f"`str` matching regex {ID_PATTERN!r}", ID_WORDS)
     before, _, rest = said.removeprefix("Expected ").partition(", got `")[0].partition("`")
     names, _, bound = rest.partition("`")
     return before + " or ".join(_KINDS.get(name, name) for name in names.split(" | ")) + bound

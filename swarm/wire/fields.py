@@ -1,8 +1,8 @@
 """Types of the fields of messages, each with its bounds.
 
-msgspec checks what `msgspec.Meta` states when it decodes. `Bounded` checks the rest, which is declared in the same
-annotations: the characters of an `Id`, and what a `Column` holds. Columns of numbers travel as little-endian bytes,
-because a list of a thousand Python ints costs a hundred times more to pack and check.
+msgspec checks what `msgspec.Meta` states when it decodes. `Bounded` checks what a `Column` holds, which is declared
+in the same annotations. Columns of numbers travel as little-endian bytes, because a list of a thousand Python ints
+costs a hundred times more to pack and check.
 
 A check raises ValueError, which the codec turns into ProtocolError. Bounds refuse; they change no message.
 """
@@ -13,11 +13,10 @@ import re
 import reprlib
 import sys
 import typing
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass
 from operator import attrgetter
 from struct import Struct
-from types import NoneType
 from typing import TYPE_CHECKING, Annotated, Any
 
 import msgspec
@@ -56,14 +55,6 @@ def numpy_loaded() -> bool:
 
 
 assert sys.byteorder == "little", "columns travel as little-endian bytes"
-
-
-@dataclass(frozen=True, slots=True)
-class Characters:
-    """In an annotation: which characters a text consists of. `Bounded` checks it with a set of those found valid,
-    because msgspec's patterns take 0.8 us each, and a fleet has 25 ids."""
-
-    pattern: re.Pattern[str]
 
 
 @dataclass(frozen=True, slots=True)
@@ -157,8 +148,9 @@ Bucket = Annotated[int, Meta(ge=ZERO_BUCKET, le=TOP_BUCKET)]
 
 # --- texts --------------------------------------------------------------------------------------------------------
 
-_ID = re.compile(r"[A-Za-z0-9_.-]{1,64}")
-Id = Annotated[str, Meta(min_length=1, max_length=64), Characters(_ID)]
+ID_PATTERN = r"^[A-Za-z0-9_.-]{1,64}\Z"
+ID_WORDS = "1 to 64 of letters, digits, '_', '.', '-'"
+Id = Annotated[str, Meta(max_length=64, pattern=ID_PATTERN)]
 """One chunk of a key: 1 to 64 of letters, digits, '_', '.', '-'."""
 VehicleId = Id
 Word = Annotated[str, Meta(max_length=100)]
@@ -217,20 +209,9 @@ def check_id(name: str, value: object) -> None:
     """Raises ValueError unless `value` can be one chunk of a key."""
     if not isinstance(value, str):
         raise ValueError(f"{name} is {reprlib.repr(value)}, expected text")
-    if value in _KNOWN_IDS:
-        return
-    if _ID.fullmatch(value) is not None:
-        if len(_KNOWN_IDS) >= _MAX_KNOWN_IDS:
-            _KNOWN_IDS.clear()  # a sender uses a new one each time
-        _KNOWN_IDS.add(value)
-    else:
-        raise ValueError(f"{name} {value[:80]!r} is not 1 to 64 of letters, digits, '_', '.', '-'")
+    if re.match(ID_PATTERN, value) is None:
+        raise ValueError(f"{name} {value[:80]!r} is not {ID_WORDS}")
 
-
-_KNOWN_IDS: set[str] = set()
-"""Ids found valid: the same few hundred come thousands of times a second, in a large swarm some ten thousand."""
-_MAX_KNOWN_IDS = 1 << 16
-"""Several times the ids of the largest swarm. Then all are forgotten: a stranger may make up any number."""
 
 # --- what msgspec cannot check ------------------------------------------------------------------------------------
 
@@ -251,11 +232,6 @@ class Bounded(msgspec.Struct, frozen=True):
         """Raises ValueError where fields contradict each other. Rules of a single field are in its type."""
 
 
-class Part(msgspec.Struct, frozen=True):
-    """Base of structs of which a message lists hundreds: the `Bounded` that lists them checks their ids all at
-    once, because a call for each takes as long as all else about it."""
-
-
 Rule = Callable[[Any], None]
 _RULES: dict[type[Bounded], tuple[Rule, ...]] = {}
 """Rules of each struct type made up to now."""
@@ -263,35 +239,17 @@ _RULES: dict[type[Bounded], tuple[Rule, ...]] = {}
 
 def _rules_of(struct: type[Bounded]) -> tuple[Rule, ...]:
     """The rules of a struct type, made of its annotations once."""
-    ids: list[str] = []
     rules: list[Rule] = []
     for name, hint in typing.get_type_hints(struct, include_extras=True).items():
         bare, notes = taken_apart(hint)
         parts = [note for part in typing.get_args(bare) for note in taken_apart(part)[1]]
-        listed = any(isinstance(note, Characters) for note in parts)
-        if any(isinstance(note, Characters) for note in notes) or (listed and NoneType in typing.get_args(bare)):
-            ids.append(name)
-        elif listed:
-            rules.append(_all_ids(name))
-        for part in typing.get_args(bare):
-            if isinstance(part, type) and issubclass(part, Part):
-                rules.extend(_ids_of_parts(name, id) for id in _ids_in(part))
         rules.extend(_column_rule(name, note) for note in notes if isinstance(note, Column) and note.checked)
         rules.extend(_columns_rule(name, note) for note in parts if isinstance(note, Column))
-    if ids:
-        rules.insert(0, _each_id(ids))
     if struct.relate is not Bounded.relate:
         rules.append(struct.relate)
     # The empty tuple would be looked for again and again.
     _RULES[struct] = tuple(rules) or (Bounded.relate,)
     return _RULES[struct]
-
-
-def _ids_in(part: type[Part]) -> list[str]:
-    """The fields of a part that are ids: it may state no other rule."""
-    notes = {name: taken_apart(hint)[1] for name, hint in typing.get_type_hints(part, include_extras=True).items()}
-    assert not any(isinstance(note, Column) for each in notes.values() for note in each), part
-    return [name for name, each in notes.items() if any(isinstance(note, Characters) for note in each)]
 
 
 def taken_apart(hint: Any) -> tuple[Any, tuple[Any, ...]]:
@@ -301,44 +259,6 @@ def taken_apart(hint: Any) -> tuple[Any, tuple[Any, ...]]:
         hint, *more = typing.get_args(hint)
         notes = (*more, *notes)
     return hint, notes
-
-
-def _ids_rule(get: Callable[[Any], Iterable[Any]], named: Callable[[Any], Iterable[tuple[str, Any]]]) -> Rule:
-    """A rule that some values of a struct are ids.
-
-    get    all of them at once, which are looked up among those found valid: the usual case
-    named  each with its place in the struct, to say which is none
-    """
-
-    def rule(struct: Any) -> None:
-        if not _KNOWN_IDS.issuperset(get(struct)):
-            for name, value in named(struct):
-                if value is not None:  # msgspec lets None pass only where there may be none
-                    check_id(name, value)
-
-    return rule
-
-
-def _each_id(names: list[str]) -> Rule:
-    """Ids that are fields."""
-    get = attrgetter(*names, names[0])  # a tuple even of one
-    return _ids_rule(get, lambda struct: ((name, getattr(struct, name)) for name in names))
-
-
-def _all_ids(name: str) -> Rule:
-    """Ids in a list, or those which are the keys of a map."""
-    get = attrgetter(name)
-    return _ids_rule(get, lambda struct: ((name, value) for value in get(struct)))
-
-
-def _ids_of_parts(name: str, id: str) -> Rule:
-    """An id of each part in a list."""
-    get, get_id = attrgetter(name), attrgetter(id)
-
-    def named(struct: Any) -> Iterable[tuple[str, Any]]:
-        return ((f"{name}[{index}].{id}", get_id(part)) for index, part in enumerate(get(struct)))
-
-    return _ids_rule(lambda struct: map(get_id, get(struct)), named)
 
 
 def _column_rule(name: str, column: Column) -> Rule:

@@ -7,10 +7,8 @@ import math
 from bisect import bisect_right
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, field
-from functools import cache, cached_property, lru_cache
+from functools import cache, cached_property
 from itertools import accumulate, pairwise
-from operator import sub
-from struct import Struct
 from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 from msgspec import Meta
@@ -25,10 +23,7 @@ from swarm.wire.fields import (
     Legs,
     Length,
     check_column,
-    column,
     np,
-    numpy_loaded,
-    pack_column,
 )
 
 if TYPE_CHECKING:
@@ -164,30 +159,14 @@ class RouteBatch:
         return self.statuses.size
 
     def __getitem__(self, index: int) -> Route:
-        if not -len(self) <= index < len(self):
-            raise IndexError(index)
-        index %= len(self)
-        begin = self.ends[index - 1] if index else 0
-        legs = slice(*self._leg_ends[index : index + 2]) if self.legs.size else slice(0)
-        return Route(
-            status=STATUSES[self.statuses[index]],
-            start=int(self.starts[index]),
-            directions=self.directions[begin : self.ends[index]].tobytes(),
-            cost_s=float(self.cost_s[index]),
-            lower_bound_s=float(self.lower_bound_s[index]),
-            length_m=float(self.length_m[index]),
-            remaining_s=float(self.remaining_s[index]),
-            legs=pack_column(self.legs[legs], "<u4"),
-        )
-
-    @cached_property
-    def _leg_ends(self) -> list[int]:
-        """Start of each route's legs, and the end of all."""
-        ends = np.searchsorted(np.cumsum(self.legs, dtype=np.int64), self.ends, "right")
-        return [0, *ends.tolist()]
+        return self._listed[index]
 
     def __iter__(self) -> Iterator[Route]:
-        return map(self.__getitem__, range(len(self)))
+        return iter(self._listed)
+
+    @cached_property
+    def _listed(self) -> list[Route]:
+        return self.columns().listed
 
     def outlines(self) -> Iterator[RouteOutline]:
         """Returns the distinguishing fields of each route: many are compared for few that are sent."""
@@ -247,8 +226,6 @@ _LEAST_CELL, _MOST_CELL = -(1 << 31), (1 << 32) - 1
 """A start is what its asker named, which may lie outside of the grid."""
 _MOST_STEPS = 4 << 20
 """Steps of one route: above all that planners give (`planner_service.planner.MOST_STEPS`)."""
-_ONE, _WIDTHS = Struct("<qI4d"), (8, 4, 8, 8, 8, 8)
-"""One value of each column of numbers, and their bytes."""
 _Numbers = Annotated[bytes, Column("<f8", per="statuses", least=0, most=math.inf)]
 
 
@@ -275,22 +252,6 @@ class Routes(Bounded, frozen=True, kw_only=True, dict=True):
         """A caller that makes them of routes knows that they are valid; one that decodes them calls
         `check_bounds`."""
 
-    def check_bounds(self) -> None:
-        if not self._is_one_found:
-            super().check_bounds()
-
-    @property
-    def _is_one_found(self) -> bool:
-        """Returns True if this is one found route that is not any-angle and breaks no rule: all columns are checked
-        together, as most replies hold one route. For any other the rules state the fault, if there is one."""
-        columns = (self.starts, self.steps, self.cost_s, self.lower_bound_s, self.length_m, self.remaining_s)
-        if self.statuses != b"\0" or self.legs or tuple(map(len, columns)) != _WIDTHS:
-            return False
-        start, steps, *numbers = _ONE.unpack(b"".join(columns))
-        in_bounds = _LEAST_CELL <= start <= _MOST_CELL and steps <= _MOST_STEPS and min(numbers) >= 0.0
-        # A sum with a NaN is not less than inf either.
-        return in_bounds and len(self.directions) == 3 * -(-steps // 8) and bool(sum(numbers) < math.inf)
-
     def relate(self) -> None:
         # Lists, not arrays: for the usual reply, a few routes, in an eighth of the time.
         listed = _listed(self.steps, "I")
@@ -305,22 +266,8 @@ class Routes(Bounded, frozen=True, kw_only=True, dict=True):
                 raise ValueError(f"{name} of a route whose status is ok is not finite")
 
     @cached_property
-    def batch(self) -> RouteBatch:
-        """Read-only arrays, made once."""
-        ends = np.cumsum(column(self.steps, "<u4"), dtype=np.int64)
-        many = int(ends[-1]) if ends.size else 0
-        return RouteBatch(
-            column(self.statuses, "u1"),
-            column(self.starts, "<i8"),
-            np.frombuffer(unpack_directions(self.directions, many), np.uint8),
-            ends,
-            **{name: column(getattr(self, name), "<f8") for name in _NUMBERS},
-            legs=column(self.legs, "<u4"),
-        )
-
-    @cached_property
     def listed(self) -> list[Route]:
-        """`Route`s, read without NumPy, made once."""
+        """`Route`s, made once."""
         steps = _listed(self.steps, "I")
         codes = unpack_directions(self.directions, sum(steps))
         ends = accumulate(steps)
@@ -342,10 +289,10 @@ class Routes(Bounded, frozen=True, kw_only=True, dict=True):
         return len(self.statuses)
 
     def __getitem__(self, index: int) -> Route:
-        return (self.batch if numpy_loaded() else self.listed)[index]
+        return self.listed[index]
 
     def __iter__(self) -> Iterator[Route]:
-        return iter(self.batch if numpy_loaded() else self.listed)
+        return iter(self.listed)
 
 
 _NUMBERS = ("cost_s", "lower_bound_s", "length_m", "remaining_s")
@@ -378,22 +325,9 @@ def _own_legs(routes: Sequence[Route]) -> Iterator[bytes]:
 
 def directions_of(cells: Sequence[int] | NDArray[np.int64], cols: int) -> bytes:
     """The direction code (0..7, clockwise from north) of each step between neighbouring cells, one byte each."""
-    if cols >= _TELLING_COLS and isinstance(cells, (list, tuple)):
-        return bytes(map(_codes_by_offset(cols).__getitem__, map(sub, cells[1:], cells)))
     rows, east = np.divmod(np.asarray(cells, np.int64), cols)
     codes: NDArray[np.uint8] = _codes()[np.diff(rows) + 1, np.diff(east) + 1]
     return codes.tobytes()
-
-
-_TELLING_COLS = 3
-"""In a grid of fewer columns two directions may add the same to a cell."""
-
-
-@lru_cache(maxsize=16)
-def _codes_by_offset(cols: int) -> dict[int, int]:
-    """Returns offset of a step in a grid with `columns` columns -> its direction code."""
-    offsets = zip(STEP_ROW, STEP_COL, strict=True)
-    return {south * cols + east: code for code, (south, east) in enumerate(offsets)}
 
 
 @cache

@@ -10,6 +10,7 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from enum import Enum
+from functools import lru_cache
 
 from swarm.errors import ProtocolError
 from swarm.peers import Peer
@@ -32,7 +33,7 @@ digest (`MOST_DIGEST_BYTES`); of the same with names and columns of the longest 
 and of files and of marks that were asked for."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Topic:
     """One topic.
 
@@ -72,12 +73,9 @@ class Topic:
     put_bytes: int = _USUAL
     ask_bytes: int = _USUAL
     answer_bytes: int = _USUAL
-    fields: tuple[str, ...] = field(init=False, repr=False, compare=False)
-    _pattern: re.Pattern[str] = field(init=False, repr=False, compare=False)
-    _repeated: tuple[str, ...] = field(init=False, repr=False, compare=False)
-    _values: dict[tuple[tuple[str, str | int], ...], tuple[Mapping[str, str], str]] = field(
-        init=False, repr=False, compare=False, default_factory=dict
-    )
+    fields: tuple[str, ...] = field(init=False, repr=False)
+    _pattern: re.Pattern[str] = field(init=False, repr=False)
+    _repeated: tuple[str, ...] = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         pattern = re.sub(r"\\{(\w+)\\}", r"(?P<\1>[^/]+)", re.escape(self.key))
@@ -110,17 +108,7 @@ class Topic:
 
         A process puts under the same few keys again and again, so both are remembered.
         """
-        given = tuple(fields.items())
-        value = self._values.get(given)
-        if value is None:
-            named = self.every(fields)
-            for name, chunk in named.items():
-                if chunk == "*":
-                    raise TypeError(f"topic {self.name} needs the field {name}")
-            if len(self._values) >= _MOST_VALUES:
-                self._values.clear()
-            value = self._values[given] = named, self.below(named)
-        return value
+        return _value(self, tuple(fields.items()))
 
     def keyed(self, namespace: str, **fields: str | int) -> str:
         """The key of one value. Raises as `value`."""
@@ -153,8 +141,15 @@ def check_size(size: int, most_bytes: int) -> None:
 
 
 _CHUNK = re.compile(r"[^/*$?#\s]+|\*")
-_MOST_VALUES = 1 << 14
-"""Keys of a topic that are remembered."""
+
+
+@lru_cache(maxsize=1 << 16)
+def _value(topic: Topic, given: tuple[tuple[str, str | int], ...]) -> tuple[Mapping[str, str], str]:
+    named = topic.every(dict(given))
+    for name, chunk in named.items():
+        if chunk == "*":
+            raise TypeError(f"topic {topic.name} needs the field {name}")
+    return named, topic.below(named)
 
 
 def _chunk(value: str | int) -> str:

@@ -112,7 +112,7 @@ def test_a_column_is_a_list_of_its_numbers_or_base64_of_its_bytes():
         (Obstacle, {"seq": 1.5}, "seq: found 1.5, expected a whole number"),
         (GiveOrder, {"subject": "paus"}, "subject: found 'paus', expected one of 'pause', 'vehicle', 'group'"),
         (Obstacle, {"seq": 1 << 70}, "OverflowError"),
-        (Obstacle, {"id": "a/b"}, "id 'a/b' is not 1 to 64 of letters"),
+        (Obstacle, {"id": "a/b"}, "id: found 'a/b', expected 1 to 64 of letters"),
         (PushedRoute, {"route": {"status": "ok", "start": 1, "directions": ["UP"]}}, "route.directions has 'UP'"),
     ],
 )

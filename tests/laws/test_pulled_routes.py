@@ -102,8 +102,8 @@ def test_cells_of_pulled_routes_are_those_that_their_segments_cross(
     starts = random.choice(np.flatnonzero(np.isfinite(pace)), 4)
     batch = finder._tree.routes([*starts.tolist(), -1])
     pulled = Puller(pace, 1.0, config).pull_batch(batch)
-    for same in (RouteBatch.of(list(batch)), batch.columns().batch):  # read-only, as those of a search are
-        assert list(Puller(pace, 1.0, config).pull_batch(same)) == list(pulled)
+    same = RouteBatch.of(list(batch))  # read-only, as those of a search are
+    assert list(Puller(pace, 1.0, config).pull_batch(same)) == list(pulled)
     for before, route in zip(batch, pulled, strict=True):
         assert (route.status, route.start, route.cost_s) == (before.status, before.start, before.cost_s)
         if not before.directions:
@@ -146,8 +146,7 @@ def test_a_route_that_would_come_back_to_a_cell_is_not_pulled() -> None:
 def encode_again(batch: RouteBatch) -> list[Route]:
     columns = batch.columns()
     columns.relate()
-    assert columns.listed == list(columns.batch)
-    return columns.listed
+    return list(columns)
 
 
 class Drive:
@@ -241,7 +240,7 @@ def test_legs_that_do_not_end_with_their_route_are_refused(legs: list[int]) -> N
         decode(payload.replace(good, bytes([0xC4, len(bad)]) + bad), PushedRoute)
     routes = RouteBatch.of([Route(**fields, directions=b"\2\2"), Route(status=RouteStatus.NO_TARGET, start=3)])
     columns = routes.columns()
-    assert [columns.batch.statuses[n] for n in (0, 1)] == [OK, NO_TARGET]
+    assert [*columns.statuses] == [OK, NO_TARGET]
     with pytest.raises(ValueError, match="legs"):
         Routes(
             **{name: getattr(columns, name) for name in Routes.__struct_fields__ if name != "legs"}, legs=bad

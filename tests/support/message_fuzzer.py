@@ -28,7 +28,7 @@ from swarm.errors import OutsideGridError, ProtocolError
 from swarm.grid import GridSpec
 from swarm.peers import Peer
 from swarm.wire.codec import decode, encode
-from swarm.wire.fields import OR_INFINITE, Bounded, Characters, Column, pack_column, taken_apart
+from swarm.wire.fields import OR_INFINITE, Bounded, Column, pack_column, taken_apart
 from swarm.wire.messages import Message
 from swarm.wire.messages.map_data import (
     BASE_DIGEST_BYTES,
@@ -275,7 +275,7 @@ class MessageFuzzer:
                 return self._chance.choice(self._classes)
             if name in ("vehicle", "vehicles", "ids") and self._chance.random() < 0.8:
                 return self._chance.choice(self._vehicles)
-            is_id = any(isinstance(note, Characters) for note in notes)
+            is_id = any(meta.pattern for meta in metas)
             return self._name() if is_id else self._chance.choice(["", "a/b", "ü" * 90, *self._names])
         if origin is bytes:
             rule = next((note for note in notes if isinstance(note, Column)), None)

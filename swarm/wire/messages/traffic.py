@@ -92,7 +92,7 @@ def _merged(base: dict[str, Held], changes: dict[str, Held]) -> dict[str, Held]:
     return {vehicle: held for vehicle, held in (base | changes).items() if held.stamps}
 
 
-class Stand(fields.Part, frozen=True, array_like=True):
+class Stand(msgspec.Struct, frozen=True, array_like=True):
     """One vehicle, as its host tells it to the members of one shard.
 
     cell    where it stands, perhaps in another shard
@@ -187,7 +187,7 @@ def entries_of(held: Iterable[Number], waits: Iterable[Entry]) -> list[Entry]:
     return [waiting.get(number) or Entry(number) for number in held]
 
 
-class Fence(fields.Bounded, frozen=True, array_like=True):
+class Fence(msgspec.Struct, frozen=True, array_like=True):
     """The entries of an earlier generation of a host, on which its vehicles may still be."""
 
     agent: fields.Id

@@ -150,6 +150,6 @@ def test_a_sender_of_many_parts_takes_turns_with_others() -> None:
     pending = PendingDigests()
     for n in range(200):
         pending.add(digest_of("keeper.q.1", authors=400, whole=False, after=(f"q{n}", 0)), 0)
-    assert len(pending._pending) == 128
+    assert len(pending._senders["keeper.q.1"].pending) == 128
     pending.add(digest_of("all.a0.1"), 0)
     assert compared_before(pending, "all.a0.1", NS_PER_S) == (1, 0)

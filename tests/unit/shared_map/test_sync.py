@@ -186,7 +186,8 @@ def test_a_digest_that_was_overtaken_replaces_no_newer_one(swarm: SwarmModel) ->
         swarm.run(0.01)
         swarm.buses["p"].gather()
         listener.sync.tick(swarm.now_ns)
-        [pending] = listener.sync._digests._pending.values()
+        [sender] = listener.sync._digests._senders.values()
+        [pending] = sender.pending.values()
         assert pending.digest.held == {"a1.1": kept[held]}
 
 

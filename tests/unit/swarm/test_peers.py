@@ -3,7 +3,7 @@
 from hypothesis import given
 from hypothesis import strategies as st
 
-from swarm.peers import SILENCE_NS, Leases, Newest, Peer, Roster
+from swarm.peers import SILENCE_NS, Newest, Peer, Roster
 
 
 def test_however_many_tokens_one_process_raises_only_its_newest_are_kept() -> None:
@@ -31,16 +31,6 @@ def test_of_each_role_the_newest_incarnations_whose_tokens_are_up_are_alive(toke
             assert list(roster.alive(role).items()) == list(alive.items())
             assert [id for id in "xy" if roster.is_alive(role, id)] == list(alive)
         assert roster.up() == sorted({(each.role, each.id) for each in up})
-
-
-def test_a_lease_runs_out_once_and_a_word_renews_it():
-    leases = Leases(lease_ns=10)
-    leases.renew("a", 0)
-    leases.renew("b", 0)
-    leases.renew("a", 8)
-    assert leases.expired(10) == []
-    assert leases.expired(11) == ["b"]
-    assert leases.expired(30) == ["a"]
 
 
 numbers = st.tuples(st.integers(0, 3), st.integers(0, 5))

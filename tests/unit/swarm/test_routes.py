@@ -1,8 +1,6 @@
 """Routes by the thousand: as arrays, as columns on the wire, and one by one."""
 
 import math
-from collections.abc import Callable
-from itertools import chain, combinations
 
 import msgspec
 import numpy as np
@@ -16,14 +14,12 @@ from planner_service.kernels import route_kernels
 from swarm.errors import ProtocolError
 from swarm.wire import route_columns as named
 from swarm.wire.codec import decode, encode
-from swarm.wire.fields import Bounded
 from swarm.wire.messages.planning import RouteReply
 from swarm.wire.route_columns import (
     STATUSES,
     UNREACHABLE,
     Route,
     RouteBatch,
-    Routes,
     RouteStatus,
     pack_directions,
     unpack_directions,
@@ -107,41 +103,3 @@ def test_columns_that_do_not_fit_each_other_are_refused_in_words(change: dict, c
     reply["routes"] = msgspec.to_builtins(COLUMNS, builtin_types=(bytes,)) | change
     with pytest.raises(ProtocolError, match=complaint):
         decode(msgspec.msgpack.encode(reply), RouteReply)
-
-
-def packed(values: list[float], dtype: str) -> list[bytes]:
-    """A column of each of these, and such of a wrong length."""
-    return [np.array([value], dtype).tobytes() for value in values] + [b"", b"\0", bytes(16)]
-
-
-NUMBERS = ("cost_s", "lower_bound_s", "length_m", "remaining_s")
-NUMBER = packed([0.0, -0.0, 1e308, math.inf, -math.inf, math.nan, -5e-324], "<f8")
-CHANGES = dict.fromkeys(NUMBERS, NUMBER) | {
-    "statuses": [b"\1", b"\11", b"\0\0", b""],
-    "starts": packed([-(1 << 31), -(1 << 31) - 1, (1 << 32) - 1, 1 << 32], "<i8"),
-    "steps": packed([0, 8, 9, 17, 4 << 20, (4 << 20) + 1], "<u4"),
-    "directions": [b"", bytes(3), bytes(9), bytes(3 << 19), bytes((3 << 19) + 3)],
-    "legs": [np.array(legs, "<u4").tobytes() for legs in ([9], [4, 5], [8], [0, 9])],
-}
-
-
-def test_one_route_is_judged_at_a_glance_as_by_the_rules() -> None:
-    found = Route(status=RouteStatus.OK, start=5, cost_s=2.0, lower_bound_s=1.0, directions=bytes(9))
-    right = msgspec.structs.asdict(RouteBatch.of([found]).columns())
-
-    def fault(check: Callable[[Routes], None], columns: Routes) -> str | None:
-        try:
-            check(columns)
-        except ValueError as error:
-            return str(error)
-        return None
-
-    values = [(name, value) for name, each in CHANGES.items() for value in each]
-    faults = set()
-    for changes in chain(combinations(values, 1), combinations(values, 2)):
-        columns = Routes(**right | dict(changes))
-        by_rules = fault(Bounded.check_bounds, columns)
-        assert fault(Routes.check_bounds, columns) == by_rules, changes
-        faults.add(by_rules)
-    assert None in faults
-    assert len(faults) > 30

@@ -8,7 +8,6 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from swarm.wire import fields
 from swarm.wire.topics import FLEET, KNOWN, MARKS, POSE, TOPICS
 
 chunks = st.text("abzAZ09_.-", min_size=1, max_size=12)
@@ -46,23 +45,6 @@ def test_a_key_that_is_remembered_is_the_one_that_would_be_made(data, topic):
         assert topic.value(given_fields) == (named, topic.key.format(**named))
     with pytest.raises(TypeError, match="has no field colour"):
         topic.value(drawn | {"colour": "red"})
-
-
-def test_no_sender_of_ever_other_keys_makes_more_of_them_remembered_than_there_is_room_for(monkeypatch):
-    monkeypatch.setattr("swarm.wire.topics._MOST_VALUES", 3)
-    for n in range(9):
-        assert POSE.keyed("swarm", target=f"new{n}") == f"swarm/target/new{n}/pose"
-        assert len(POSE._values) <= 3
-
-
-def test_a_sender_of_ever_new_ids_makes_no_process_know_more_than_there_is_room_for(monkeypatch):
-    monkeypatch.setattr(fields, "_MAX_KNOWN_IDS", 10)
-    monkeypatch.setattr(fields, "_KNOWN_IDS", set())
-    for n in range(100):
-        fields.check_id("vehicle", f"v{n}")
-        with pytest.raises(ValueError, match="is not 1 to 64 of letters"):
-            fields.check_id("vehicle", f"v/{n}")
-        assert len(fields._KNOWN_IDS) <= 10
 
 
 @pytest.mark.parametrize("wrong", ["", "a/b", "a*", "$*", "**", "a b", "a?b", "a#", "\n"])
