@@ -1,16 +1,22 @@
-"""Terrains that are stored: prepared in a run's folder for every process of a machine.
+"""Terrains that are stored: prepared in a run's folder for every process of a machine, and kept from run to run.
 
-The launcher builds a terrain once, and all processes map what it left. Each checks each file against its sum before
-it uses it.
+The launcher builds a terrain once, and all processes map what it left. Built-in terrains are kept in the user's
+cache folder beside: making one again gives the same bits, slowly. One is kept under the digest of all that it is
+made from: the scenario's part in it, and the code. Its files are linked into a run's folder where the file system
+allows, so that they lie on the disk once. Each process checks each file against its sum before it uses it.
 """
 
 from __future__ import annotations
 
 import hashlib
+import logging
 import os
+import shutil
+import time
 import zlib
 from collections.abc import Iterable, Mapping
 from contextlib import suppress
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +24,7 @@ import msgspec
 import numpy as np
 from numpy.typing import NDArray
 
-from shared_map.array_files import Bools, Floats, give_back_memory, open_array, save_array
+from shared_map.array_files import Bools, Floats, give_back_memory, open_array, save_array, source_digest
 from shared_map.terrain.pace_layers import largest_part
 from shared_map.terrain.row_bands import Progress, no_progress
 from shared_map.terrain.slope_and_climb import ENTRIES, Climb, Wind
@@ -28,12 +34,19 @@ from shared_map.terrain.zones import files_of_zone
 from swarm.config.input_files import FileKind, read_text
 from swarm.config.plugin_names import cost_layers_of
 from swarm.config.scenario import Scenario
-from swarm.errors import SwarmError, TerrainError
+from swarm.config.scenario_files import BUILT_IN_TERRAINS
+from swarm.errors import StoreError, SwarmError, TerrainError
 from swarm.files import write_file, writing
 from swarm.grid import GridSpec
 from swarm.plugins import source_of
 from swarm.runtime.role_setup import RoleSetup
 
+log = logging.getLogger(__name__)
+
+MOST_BYTES = 2 << 30
+"""Limit for all cached terrains together; the least recently used go first."""
+_ABANDONED_S = 3600.0
+"""A folder that is still being written is younger: to write `MOST_BYTES` takes minutes on a slow disk."""
 _META = "terrain.json"
 _NEWEST = 50
 """The folders of runs in which a prepared terrain is looked for."""
@@ -269,14 +282,99 @@ def homes_of(prior: Floats, truth: Floats) -> Bools:
 
 
 def prepare(folder: Path, scenario: Scenario, progress: Progress = no_progress) -> tuple[Terrain, Floats]:
-    """Builds terrain and truth of a scenario, and leaves them in a folder for the other processes. The result is
-    mapped, as theirs."""
-    key = scenario_key(scenario)
-    terrain = build_terrain(scenario, progress)
-    save_prepared(folder, terrain, build_truth(scenario, terrain), key)
-    del terrain
-    give_back_memory()
+    """Builds terrain and truth of a scenario, unless they are kept from an earlier run, and leaves them in a folder
+    for the other processes. The result is mapped, as theirs."""
+    key, kept = scenario_key(scenario), kept_key(scenario)
+    if kept is None or not fetch_kept(kept, folder):
+        terrain = build_terrain(scenario, progress)
+        save_prepared(folder, terrain, build_truth(scenario, terrain), key)
+        del terrain
+        give_back_memory()
+        if kept is not None:
+            keep(kept, [folder / _META, *folder.glob("*.npy")])
     mapped, truth = load_prepared(folder, key), load_beside(folder, "truth", key)
     if mapped is None or truth is None:
         raise TerrainError(f"the prepared terrain in {folder} has gone: it is another run's; start again")
     return mapped, truth
+
+
+# --- kept from run to run -----------------------------------------------------------------------------------
+
+
+def kept_root() -> Path:
+    """Returns the folder of cached terrains."""
+    home = os.environ.get("XDG_CACHE_HOME")
+    return (Path(home) if home else Path.home() / ".cache") / "terrain-swarm" / "terrain"
+
+
+def kept_key(scenario: Scenario) -> str | None:
+    """Digest of all that a terrain and its truth follow from; None where files of the user's have a part in it."""
+    terrain, cost = scenario.terrain, scenario.cost
+    zones = (*cost.zones, *terrain.hidden.zones)
+    files = terrain.photo or terrain.labels or terrain.cover or cost.layers or any(z.mask or z.file for z in zones)
+    if terrain.source not in BUILT_IN_TERRAINS or files:
+        return None
+    here = Path(__file__).parent
+    rooms = (here, here.parent / "importers")
+    code = source_digest(here.parent, *sorted(each.parent for room in rooms for each in room.rglob("__init__.py")))
+    # One of them brings the elevation of "jacksboro".
+    libraries = " ".join(map(version, ("scipy", "matplotlib", "rasterio")))
+    payload = msgspec.json.encode([code, libraries, scenario.seed, terrain, cost], order="sorted")
+    return hashlib.blake2b(payload, digest_size=16).hexdigest()
+
+
+def fetch_kept(key: str, into: Path) -> bool:
+    """Puts the files of a kept terrain into a folder. False if there is none; a damaged one is dropped, and
+    said."""
+    folder = kept_root() / key
+    if not folder.is_dir():
+        return False
+    try:
+        into.mkdir(parents=True, exist_ok=True)
+        for path in folder.iterdir():
+            _link(path, into / path.name)
+        if load_prepared(into) is None or any(load_beside(into, name) is None for name in ("truth", "homes")):
+            raise TerrainError("a file is missing")
+        os.utime(folder)
+    except (OSError, TerrainError) as error:
+        log.warning("the kept terrain %s is damaged (%s): rebuilding it", folder, error)
+        shutil.rmtree(folder, ignore_errors=True)
+        return False
+    return True
+
+
+def keep(key: str, files: Iterable[Path]) -> None:
+    """Keeps these files of a terrain. If that is not possible, no terrain is cached, without an error."""
+    files = list(files)
+    root = kept_root()
+    partial = root / f"{key}.{os.getpid()}.part"
+    try:
+        if sum(path.stat().st_size for path in files) > MOST_BYTES:
+            return
+        partial.mkdir(parents=True)
+        for path in files:
+            _link(path, partial / path.name)
+        partial.rename(root / key)
+        _evict(root)
+    except (OSError, StoreError) as error:
+        log.info("the terrain is not kept in %s: %s", root, error)
+    finally:
+        shutil.rmtree(partial, ignore_errors=True)
+
+
+def _evict(root: Path) -> None:
+    """Drops the least recently used terrains, down to `MOST_BYTES`, and partial files of killed processes."""
+    left = MOST_BYTES
+    for folder in sorted(root.iterdir(), key=lambda each: each.stat().st_mtime, reverse=True):
+        left -= sum(path.stat().st_size for path in folder.iterdir())
+        abandoned = folder.suffix == ".part" and time.time() - folder.stat().st_mtime > _ABANDONED_S
+        if left < 0 or abandoned:
+            shutil.rmtree(folder, ignore_errors=True)
+
+
+def _link(source: Path, to: Path) -> None:
+    to.unlink(missing_ok=True)
+    try:
+        os.link(source, to)
+    except OSError:  # another file system
+        shutil.copyfile(source, to)

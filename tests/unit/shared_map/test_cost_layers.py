@@ -8,7 +8,7 @@ import pytest
 from support.plugin_modules import forgotten_afterwards
 
 from launch_scripts.launcher.fetched_terrain import missing_files
-from shared_map.terrain.store import scenario_key
+from shared_map.terrain.store import kept_key, scenario_key
 from shared_map.terrain.terrain import Terrain, build_terrain
 from shared_map.terrain.true_ground import build_truth
 from swarm.config.scenario import Scenario
@@ -101,6 +101,8 @@ def test_a_prepared_terrain_is_of_no_use_once_the_module_has_changed(folder: Pat
     assert scenario_key(scenario(folder, ("Factor", 1.5))) == before
     (folder / "layers.py").write_text(MODULE.replace("return pace *", "return pace * 2 *"))
     assert scenario_key(scenario(folder, ("Factor", 1.5))) != before
+    assert kept_key(scenario(folder, ("Factor", 1.5))) is None
+    assert kept_key(scenario(folder)) is not None
 
 
 def test_a_machine_that_lacks_the_module_has_to_fetch_the_map(folder: Path) -> None:

@@ -11,7 +11,7 @@ from typer.testing import CliRunner
 
 from launch_scripts.commands.terrain_commands import app
 from launch_scripts.launcher.fetched_terrain import missing_files
-from shared_map.terrain.store import scenario_key
+from shared_map.terrain.store import kept_key, scenario_key
 from shared_map.terrain.terrain import build_terrain
 from shared_map.terrain.true_ground import build_truth
 from swarm.config.scenario import Scenario
@@ -50,6 +50,7 @@ def test_a_terrain_changes_with_its_files_and_not_with_where_they_lie(tmp_path: 
     assert scenario_key(first) != key
     wider = json.loads(json.dumps(AREA).replace("300", "400"))
     assert build_terrain(scenario_in(tmp_path / "b", area=wider)).digest != terrain.digest
+    assert kept_key(first) is None
     (tmp_path / "a" / "area.geojson").unlink()
     assert missing_files(first) == [str(tmp_path / "a" / "area.geojson")]
     with pytest.raises(TerrainError, match=r"^cannot read cost\.zones\[0\]: .*area\.geojson: No such file"):
