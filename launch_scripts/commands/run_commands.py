@@ -13,7 +13,7 @@ import signal
 import sys
 import time
 from collections import deque
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass
 from datetime import datetime
@@ -240,36 +240,36 @@ def down(run: RunArgument = None) -> int:
     from launch_scripts.observe.run_folders import is_of_a_swarm, read_report
 
     found = _chosen(run, only=True)
+    name, launchers = found[0].name, [pid for part in found for pid in part.launchers]
     terminal, until_s = Terminal(as_json=False, plain=False), time.monotonic() + _DOWN_S
-    if not found.launchers and (left_over := found.processes()):
+    if not launchers and (left_over := _processes(found)):
         for pid in left_over.values():
             with suppress(psutil.NoSuchProcess):
                 psutil.Process(pid).kill()
-        terminal.say(f"run {found.name} had no launcher any more; killed: {', '.join(sorted(left_over))}")
+        terminal.say(f"run {name} had no launcher any more; killed: {', '.join(sorted(left_over))}")
         return 0
-    if not found.launchers:
-        which = "no run of yours runs" if run is None else f"run {found.name} does not run"
-        raise ConfigError(f"{which} here; `swarm ps` lists those which do")
-    for pid in found.launchers:
+    if not launchers:
+        which = "no run of yours runs here" if run is None else _does_not_run(found)
+        raise ConfigError(f"{which}; `swarm ps` lists those which do")
+    for pid in launchers:
         with suppress(psutil.NoSuchProcess):  # it ended by itself
             process = psutil.Process(pid)
             if not is_of_a_swarm(pid):
-                raise ConfigError(
-                    f"run {found.name}: process {pid} is no launcher; its entry in the registry is wrong"
-                )
+                raise ConfigError(f"run {name}: process {pid} is no launcher; its entry in the registry is wrong")
             process.send_signal(signal.SIGINT)
             process.resume()  # a stopped one does not hear before
-    with terminal.busy(f"run {found.name} ends and writes its report"):
-        while (left := _run_in(found.folder).launchers) and time.monotonic() < until_s:
+    with terminal.busy(f"run {name} ends and writes its report"):
+        while (left := _launchers_now(found)) and time.monotonic() < until_s:
             time.sleep(_TURN_S)
     if left:
         pids = ", ".join(map(str, left))
-        terminal.say(f"run {found.name} still ends after {_DOWN_S:g} s; its launcher has the pid {pids}", "red")
+        terminal.say(f"run {name} still ends after {_DOWN_S:g} s; its launcher has the pid {pids}", "red")
         return 1
-    with suppress(SwarmError):
-        terminal.say(str(read_report(found.folder).get("verdict", "")))
-    for line in [f"run {found.name} has ended; its folder is {found.folder}", *what_is_left(found.folder)]:
-        terminal.say(line)
+    for part in found:
+        with suppress(SwarmError):
+            terminal.say(str(read_report(part.folder).get("verdict", "")))
+        for line in [f"run {name} has ended; its folder is {part.folder}", *what_is_left(part.folder)]:
+            terminal.say(line)
     return 0
 
 
@@ -290,12 +290,13 @@ def logs(
     run      Name of the run, or its folder. Default: the newest active run, else the newest ended one.
     """
     found = _chosen(run)
-    names = sorted({file.name.partition(".log")[0] for file in _log_files(found.folder)})
+    folders = [part.folder for part in found]
+    names = sorted({file.name.partition(".log")[0] for file in _log_files(folders)})
     if process is not None and process not in names:
         has = choice(process, names, " it has ") if names else "; it has no logs"
-        raise ConfigError(f"run {found.name} has no log of {process!r}{has}")
+        raise ConfigError(f"run {found[0].name} has no log of {process!r}{has}")
     width, read = max(map(len, names), default=0), dict[int, int]()
-    told: Iterable[_Line] = _new_lines(found.folder, process, read)
+    told: Iterable[_Line] = _new_lines(folders, process, read)
     told = told if lines is None else deque(told, maxlen=lines)
     with suppress(KeyboardInterrupt), stop_requests() as stopping:
         while not stopping():
@@ -303,10 +304,9 @@ def logs(
                 typer.echo(plain(text) if process else f"{name:<{width}} | {plain(text)}")
             if not follow:
                 return
-            now = _run_in(found.folder)
-            follow = bool(now.launchers or now.processes())  # once more after its end
+            follow = bool(_launchers_now(found) or _processes(found))  # once more after its end
             time.sleep(_TURN_S)
-            told = _new_lines(found.folder, process, read)
+            told = _new_lines(folders, process, read)
 
 
 @command(app, RUN)
@@ -323,11 +323,13 @@ def open(run: RunArgument = None, only_print: Annotated[bool, typer.Option("--pr
     from launch_scripts.ports import page_of
 
     found = _chosen(run)
-    report = found.folder / "report.html"
-    if not (found.web_port if found.launchers else report.is_file()):
-        what = "serves no live page" if found.launchers else "is over and left no report"
-        raise ConfigError(f"run {found.name} {what}; `swarm logs --run {found.name}` says more")
-    address = page_of(found.web_port) if found.launchers else report.as_uri()
+    pages = [page_of(part.web_port) for part in found if part.launchers and part.web_port]
+    reports = [part.folder / "report.html" for part in found if not part.launchers]
+    pages += [report.as_uri() for report in reports if report.is_file()]
+    if not pages:
+        what = "is over and left no report" if reports else "serves no live page"
+        raise ConfigError(f"run {found[0].name} {what}; `swarm logs --run {found[0].name}` says more")
+    address = pages[0]
     typer.echo(address)
     if not only_print:
         webbrowser.open(address)
@@ -343,18 +345,18 @@ def kill(process: Annotated[str, typer.Argument(metavar="ROLE-ID")], run: RunOpt
     run      Name of the run, or its folder; optional if exactly one run is running here.
     """
     found = _chosen(run, only=True)
-    running = found.processes()
-    again = "its launcher starts it again" if found.launchers else "it had no launcher any more"
+    name, running = found[0].name, _processes(found)
+    again = "its launcher starts it again" if _launchers_now(found) else "it had no launcher any more"
     if not running:
-        raise ConfigError(f"run {found.name} does not run here; `swarm ps` lists those which do")
+        raise ConfigError(f"{_does_not_run(found)}; `swarm ps` lists those which do")
     if process not in running:
         has = choice(process, sorted(running), " it has ")
-        raise ConfigError(f"run {found.name} has no process {process!r} on this machine{has}")
+        raise ConfigError(f"run {name} has no process {process!r} on this machine{has}")
     try:
         psutil.Process(running[process]).kill()
     except psutil.NoSuchProcess:
         raise ConfigError(f"{process} has just ended by itself") from None
-    typer.echo(f"{process} of run {found.name}, pid {running[process]}, is killed: {again}")
+    typer.echo(f"{process} of run {name}, pid {running[process]}, is killed: {again}")
 
 
 def in_background(*, as_json: bool) -> int:
@@ -387,23 +389,22 @@ def in_background(*, as_json: bool) -> int:
                 launcher.send_signal(signal.SIGINT)
 
 
-def _chosen(name: str | None, only: bool = False) -> KnownRun:
-    """The run of a name or folder; without one the newest active run, else the newest ended one. Raises
-    ConfigError, with `only` also if several runs are active."""
-    from launch_scripts.observe.run_folders import LAST, RUNS, find_run, registered
+def _chosen(name: str | None, only: bool = False) -> list[KnownRun]:
+    """The parts of a run on this machine, by its name or a folder; without one of the newest active run, else of
+    the newest ended one. Raises ConfigError, with `only` also if several runs are active."""
+    from launch_scripts.observe.run_folders import LAST, RUNS, find_parts, registered
 
     # LAST is the newest run of this folder; in a folder without runs it must not end one of several others.
     if name is None or (name == LAST and not os.path.isdir(RUNS / LAST)):
         if not (known := registered()):
             raise ConfigError("no run of yours is registered on this machine; `swarm up SCENARIO` starts one")
-        running = [each for each in known if each.launchers]
+        running = list(dict.fromkeys(each.name for each in known if each.launchers))
         if only and len(running) > 1:
-            names = [each.name for each in known]  # one may be that of several folders, as of two parts of a run
-            told = ", ".join(r.name if names.count(r.name) == 1 else str(r.folder) for r in running)
+            told = ", ".join(running)
             raise ConfigError(f"found {len(running)} runs here, expected the name or folder of one: {told}")
-        say_newest(known[0].name, [each.name for each in running[1:]])
-        return known[0]
-    return _run_in(find_run(name, RUNS).resolve())
+        name = known[0].name
+        say_newest(name, running[1:])
+    return [_run_in(folder.resolve()) for folder in find_parts(name, RUNS)]
 
 
 def _run_in(folder: Path) -> KnownRun:
@@ -411,6 +412,19 @@ def _run_in(folder: Path) -> KnownRun:
     from launch_scripts.observe.run_folders import KnownRun, registered
 
     return next((run for run in registered() if run.folder == folder), KnownRun(folder, (), 0, False))
+
+
+def _launchers_now(parts: Sequence[KnownRun]) -> list[int]:
+    return [pid for part in parts for pid in _run_in(part.folder).launchers]
+
+
+def _processes(parts: Sequence[KnownRun]) -> dict[str, int]:
+    """Name -> pid of the processes of a run that are there now."""
+    return {name: pid for part in parts for name, pid in part.processes().items()}
+
+
+def _does_not_run(parts: Sequence[KnownRun]) -> str:
+    return f"run {parts[0].name} does not run in {', '.join(str(part.folder) for part in parts)}"
 
 
 def _fields(run: KnownRun, processes: int) -> dict[str, Any]:
@@ -427,7 +441,9 @@ def _fields(run: KnownRun, processes: int) -> dict[str, Any]:
     else:
         state = "ended" if os.path.exists(report) or facts.get("recorded") is False else "broke off"
     began: str | None = str(facts.get("began"))
-    now_s = time.time() if run.launchers else max((f.stat().st_mtime for f in _log_files(run.folder)), default=0.0)
+    now_s = (
+        time.time() if run.launchers else max((f.stat().st_mtime for f in _log_files([run.folder])), default=0.0)
+    )
     try:
         lasted_s = round(max(now_s - datetime.fromisoformat(str(began)).timestamp(), 0.0))
     except (ValueError, OverflowError):  # damaged
@@ -448,19 +464,18 @@ def _fields(run: KnownRun, processes: int) -> dict[str, Any]:
 # --- logs ---------------------------------------------------------------------------------------------------------
 
 
-def _log_files(folder: Path) -> list[Path]:
+def _log_files(folders: Iterable[Path]) -> list[Path]:
     """Logs of a run, the earlier of two of a process first."""
-    return sorted(
-        (file for end in ("log", "log.1") for file in folder.glob(f"*.{end}") if file.is_file()), reverse=True
-    )
+    files = (file for folder in folders for end in ("log", "log.1") for file in folder.glob(f"*.{end}"))
+    return sorted(filter(Path.is_file, files), key=lambda file: file.name, reverse=True)
 
 
-def _new_lines(folder: Path, process: str | None, read: dict[int, int]) -> Iterator[_Line]:
+def _new_lines(folders: Iterable[Path], process: str | None, read: dict[int, int]) -> Iterator[_Line]:
     """Yields lines of all logs, or of those of one process, by time.
 
     read  inode of a file, which keeps it under a new name -> number of bytes that have been read; grows here
     """
-    files = [file for file in _log_files(folder) if process in (None, file.name.partition(".log")[0])]
+    files = [file for file in _log_files(folders) if process in (None, file.name.partition(".log")[0])]
     return heapq.merge(*(_lines_of(file, read) for file in files), key=lambda line: line[0])
 
 

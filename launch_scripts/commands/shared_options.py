@@ -225,17 +225,18 @@ def find_swarm(runs: Path | None = None, name: str | None = None) -> list[tuple[
     name  of the run, or its folder; only that is looked at then
     Raises BusError if no router listens, ConfigError if there is no run of that name.
     """
-    from launch_scripts.observe.run_folders import RUNS, KnownRun, find_run, registered
+    from launch_scripts.observe.run_folders import RUNS, KnownRun, find_parts, registered
     from swarm.config.scenario import NetworkConfig
     from swarm.endpoints import listening
 
     if name is not None:
-        folder = find_run(name, runs or RUNS)
-        network = network_of(folder)
-        if network is not None and any(map(listening, network.connect)):
-            return [(folder.resolve().name, network)]
-        looked = "it names no router" if network is None else ", ".join(network.connect)
-        raise BusError(f"run {name} does not run here: no process listens ({looked})")
+        looked = []
+        for folder in find_parts(name, runs or RUNS):
+            network = network_of(folder)
+            if network is not None and any(map(listening, network.connect)):
+                return [(folder.resolve().name, network)]
+            looked.append("it names no router" if network is None else ", ".join(network.connect))
+        raise BusError(f"run {name} does not run here: no process listens ({'; '.join(looked)})")
     # Of runs with the same router only the newest can be connected to it.
     by_router: dict[tuple[str, ...], tuple[KnownRun, NetworkConfig]] = {}
     here = (each for each in registered() if runs is None or each.folder.parent == runs.resolve())

@@ -283,6 +283,15 @@ def find_run(name: str, runs: Path) -> Path:
     raise ConfigError(f"there is no run {name!r}: neither a folder nor in {runs}; `swarm ps -a` lists your runs")
 
 
+def find_parts(name: str, runs: Path) -> list[Path]:
+    """The folders of a run on this machine, one of each of its launchers that has its own, as where two machines
+    are rehearsed on one; only those where a launcher runs, if there are such. A path is that one folder. Raises
+    ConfigError as `find_run`."""
+    parts = [run for run in registered() if run.name == name] if runs == RUNS else []
+    active = [run.folder for run in parts if run.launchers]
+    return active or [run.folder for run in parts] or [find_run(name, runs)]
+
+
 def lacks(folder: Path, file: str) -> ConfigError:
     """The error where a run's folder lacks a file that a run leaves at its end, and why it does."""
     why = "the run has not ended yet, or its launcher was killed"

@@ -127,14 +127,35 @@ def test_a_run_is_found_by_its_name_from_any_folder_until_its_folder_goes(
         ConfigError, match=r"found 2 runs called 'first', expected the folder of one: /.*/third/first"
     ):
         find_run("first", Path("runs"))
-    with pytest.raises(ConfigError, match=r"expected the name or folder of one: second, /.*/first/first$"):
+    with pytest.raises(ConfigError, match=r"expected the name or folder of one: second, first$"):
         _chosen("LAST", only=True)  # here is no run of which that could be the newest
+    assert [part.folder.parent.name for part in _chosen("first")] == ["first"], "its launcher runs"
+    assert [part.folder.parent.name for part in _chosen(str(tmp_path / "third" / "first"))] == ["third"]
     (tmp_path / "third" / "first").rmdir()
     (tmp_path / "second").rename(tmp_path / "away")
     assert [run.name for run in registered()] == ["second", "first"], "the launcher of the second one runs"
     changed(tmp_path, pid=NOBODY)
     assert [run.name for run in registered()] == ["first"]
     assert len(list((tmp_path / "state" / "runs").iterdir())) == 1
+
+
+def test_a_run_in_two_folders_is_one_run_by_its_name(
+    tmp_path: Path, listens: list[int], monkeypatch: pytest.MonkeyPatch, swarm: Swarm
+) -> None:
+    for half, port in zip(("a", "b"), listens, strict=True):
+        make_run(tmp_path / half, "halves", port)
+        (tmp_path / half / "halves" / f"agent-{half}0.log").write_text(
+            f"2026-01-01 00:00:0{port % 10} from {half}\n"
+        )
+    mine = {"folder": str(tmp_path / "a/halves"), "pid": os.getpid(), "started_s": _started_s(os.getpid())}
+    (tmp_path / "state/runs/other.json").write_text(json.dumps(mine))
+    for folder, path in ((tmp_path, "a/halves"), (tmp_path / "a", "../a/halves")):
+        monkeypatch.chdir(folder)
+        for name, halves in (("halves", {"a", "b"}), (None, {"a", "b"}), (path, {"a"})):
+            assert {part.folder.parent.name for part in _chosen(name, only=True)} == halves
+    told = swarm("logs --run halves")[1]
+    assert ("from a" in told, "from b" in told) == (True, True)
+    assert find_swarm(name="halves")[0][0] == "halves"
 
 
 @pytest.mark.parametrize("change", [{"pid": NOBODY}, {"started_s": 0.5}])
@@ -160,7 +181,7 @@ def test_what_outlives_its_launcher_is_seen_and_ended(is_ours: bool, tmp_path: P
             told = swarm("down r")
             assert (run["state"], run["processes"]) == ("left over", 1)
             assert told[0] == (0 if is_ours else 2)
-            assert ("killed: agent-a0" if is_ours else "r does not run here") in told[1] + told[2]
+            assert ("killed: agent-a0" if is_ours else "r does not run in ") in told[1] + told[2]
             assert (left.wait(30) if is_ours else left.poll()) == (-9 if is_ours else None)
         finally:
             left.kill()

@@ -164,7 +164,7 @@ def test_followed_logs_end_though_a_library_swallows_the_exception(
             signal.raise_signal(signal.SIGTERM)
         return active
 
-    monkeypatch.setattr(run_commands, "_chosen", lambda run: active)
+    monkeypatch.setattr(run_commands, "_chosen", lambda run: [active])
     monkeypatch.setattr(run_commands, "_run_in", swallows)
     run_commands.logs(follow=True)
 
