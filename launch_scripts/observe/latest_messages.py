@@ -15,18 +15,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 from launch_scripts.observe.summed_counts import Counts, sum_of
-from shared_map.replication.marks import is_tombstone, supersedes
-from shared_map.replication.merge import winners
+from shared_map.replication.marks import fault, is_tombstone, supersedes
+from shared_map.replication.merge import TileChange, new_winners
 from swarm.clock import NS_PER_S
 from swarm.config.scenario import Scenario, agent_of, crew_of
-from swarm.grid import TILE_CELLS, GridSpec
+from swarm.grid import GridSpec
 from swarm.peers import FOR_GOOD_NS, HIGHEST_RANK, Newest, Peer, ranked_id, split_rank
 from swarm.right_of_way.generations import keep_last
 from swarm.runtime.order_book import OrderBook
 from swarm.runtime.stats import ENDED
 from swarm.runtime.tracker_ownership import Trackings
 from swarm.wire.messages import Message
-from swarm.wire.messages.map_data import MarkKind, MarkSet, owner_of
+from swarm.wire.messages.map_data import MarkSet, owner_of
 from swarm.wire.messages.orders import GoalState, GoalStates, Orders
 from swarm.wire.messages.planning import PlannerStatus, TargetPose
 from swarm.wire.messages.processes import Heartbeat, RunInfo, Stats
@@ -268,7 +268,7 @@ class LatestState(Counts):
             case TargetPose():
                 self.moved_ns = max(self.moved_ns, now_ns)
                 return self._trackings.counted(message, now_ns)
-            case MarkSet():
+            case MarkSet(tile=tile) if tile == self.grid.tiles or fault(message, self.grid) is None:
                 of = (message.author, message.tile)
                 marks = self._marks.get(of) or self._tombstones.get(of)
                 if marks is None or supersedes(message, marks):
@@ -481,15 +481,8 @@ class LatestState(Counts):
         for (_, tile), marks in sorted(self._marks.items()):
             if tile < self.grid.tiles:
                 of_tile.setdefault(tile, []).append(marks)
-        types = (np.int64, np.uint8, np.float32, np.int64)
-        found = [MarkedCells._make(np.zeros(0, type) for type in types)]
-        for tile, sets in of_tile.items():
-            window, stated = self.grid.tile_window(tile), winners(sets, self.moved_ns)
-            rows, cols = np.divmod(stated.cells.astype(np.int64), TILE_CELLS)
-            rows, cols = rows + window.row0, cols + window.col0
-            kept = (stated.kinds != MarkKind.CLEAR) & (rows < window.row1) & (cols < window.col1)
-            columns = (rows * self.grid.cols + cols, stated.kinds, stated.paces, stated.stamps_ns)
-            found.append(MarkedCells._make(each[kept] for each in columns))
-        joined = [np.concatenate(each) for each in zip(*found, strict=True)]
-        order = np.argsort(joined[0])
-        return MarkedCells._make(each[order] for each in joined)
+        changes = [TileChange(tile, (), sets) for tile, sets in of_tile.items()]
+        won = new_winners(self.grid, changes, 0, self.moved_ns)
+        order = np.argsort(won.cells)
+        cells = won.cells[order].astype(np.int64)
+        return MarkedCells(cells, won.kinds[order], won.paces[order], won.stamps_ns[order])

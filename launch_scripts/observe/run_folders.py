@@ -12,7 +12,6 @@ from __future__ import annotations
 import datetime
 import importlib.metadata
 import json
-import math
 import os
 import platform
 import re
@@ -27,7 +26,7 @@ from typing import Annotated, Any
 import msgspec
 import psutil
 
-from swarm.config.input_files import FileKind, read_text
+from swarm.config.input_files import FileKind, read_bytes
 from swarm.config.scenario import Scenario
 from swarm.config.scenario_files import scenario_text
 from swarm.errors import ConfigError, StoreError, SwarmError
@@ -143,7 +142,7 @@ def _entries() -> Iterator[tuple[Path, _Entry]]:
                 files += [(file.lstat().st_mtime_ns, file)] if not file.name.endswith(".part.json") else []
     for _, file in sorted(files, reverse=True):
         with suppress(OSError, SwarmError, msgspec.MsgspecError, RecursionError):
-            yield file, msgspec.json.decode(read_text(file, FileKind.RUN), type=_Entry)
+            yield file, msgspec.json.decode(read_bytes(file, FileKind.RUN), type=_Entry)
 
 
 def _started_s(pid: int) -> float:
@@ -248,11 +247,9 @@ def ended(folder: Path) -> dict[str, Any]:
 
 def run_facts(folder: Path) -> dict[str, Any]:
     """Returns the content of `run.json`; empty if it cannot be read."""
-    try:
-        facts = json.loads(read_text(folder / RUN_FILE, FileKind.RUN))
-    except (SwarmError, OSError, ValueError, RecursionError):
-        return {}
-    return facts if isinstance(facts, dict) else {}
+    with suppress(SwarmError, OSError, msgspec.MsgspecError, RecursionError):
+        return msgspec.json.decode(read_bytes(folder / RUN_FILE, FileKind.RUN), type=dict[str, Any])
+    return {}
 
 
 def point_last(folder: Path) -> str | None:
@@ -297,19 +294,9 @@ def read_report(folder: Path) -> dict[str, Any]:
     if not path.exists():
         raise lacks(folder, REPORT_FILE)
     try:
-        text, number = read_text(path, FileKind.RUN), _number
-        report = json.loads(text, parse_int=number, parse_float=number, parse_constant=number)
-        if not isinstance(report, dict):
-            raise ValueError("found no object, expected the figures of a run")
-        return report
-    except (ValueError, RecursionError) as error:
+        return msgspec.json.decode(read_bytes(path, FileKind.RUN), type=dict[str, Any])
+    except (msgspec.MsgspecError, RecursionError) as error:
         raise StoreError(f"{path} is damaged: {error}") from error
-
-
-def _number(text: str) -> float:
-    if not math.isfinite(value := float(text)):
-        raise ValueError(f"found {text[:30]}, expected a number")
-    return int(text) if text.lstrip("-").isdecimal() else value
 
 
 def version_of(package: str) -> str | None:
