@@ -1,7 +1,7 @@
 """The written form of texts, moments and durations for people, on a terminal, in a log and on a page.
 
-A moment is a time of day, `at 14:22:10`. A duration is a length of time, `for 19 min`. A time after "since" would be
-neither.
+A moment is a time of day, `at 14:22:10`. A duration is a length of time, `for 19 min`. A time after "since" would
+be neither.
 """
 
 from __future__ import annotations
