@@ -269,9 +269,9 @@ class OutsideObserver(RunObserver):
 # --- who takes part, and where ------------------------------------------------------------------------------------
 
 
-def ask_run(bus: Bus, timeout_s: float = _ASK_TIMEOUT_S, *, routers: bool = False) -> list[RunInfo]:
+def ask_run(bus: Bus, *, routers: bool = False) -> list[RunInfo]:
     """Members of the run in the namespace, as each answers for itself; with `routers` those, too."""
-    replies, _ = replies_to(bus, wire_topics.RUN, Nothing(), timeout_s)
+    replies, _ = replies_to(bus, wire_topics.RUN, Nothing(), _ASK_TIMEOUT_S)
     return [each for each in replies if isinstance(each, RunInfo) and (routers or each.run_id != NO_RUN)]
 
 
