@@ -12,6 +12,7 @@ from __future__ import annotations
 import datetime
 import importlib.metadata
 import json
+import math
 import os
 import platform
 import re
@@ -26,7 +27,7 @@ from typing import Annotated, Any
 import msgspec
 import psutil
 
-from swarm.config.input_files import FileKind, read_bytes
+from swarm.config.input_files import FileKind, read_bytes, read_text
 from swarm.config.scenario import Scenario
 from swarm.config.scenario_files import scenario_text
 from swarm.errors import ConfigError, StoreError, SwarmError
@@ -294,9 +295,19 @@ def read_report(folder: Path) -> dict[str, Any]:
     if not path.exists():
         raise lacks(folder, REPORT_FILE)
     try:
-        return msgspec.json.decode(read_bytes(path, FileKind.RUN), type=dict[str, Any])
-    except (msgspec.MsgspecError, RecursionError) as error:
+        text, number = read_text(path, FileKind.RUN), _number
+        report = json.loads(text, parse_int=number, parse_float=number, parse_constant=number)
+        if not isinstance(report, dict):
+            raise ValueError("found no object, expected the figures of a run")
+        return report
+    except (ValueError, RecursionError) as error:
         raise StoreError(f"{path} is damaged: {error}") from error
+
+
+def _number(text: str) -> float:
+    if not math.isfinite(value := float(text)):
+        raise ValueError(f"found {text[:30]}, expected a number")
+    return int(text) if text.lstrip("-").isdecimal() else value
 
 
 def version_of(package: str) -> str | None:

@@ -354,7 +354,7 @@ def test_the_command_shows_settings_and_figures(runs: Path, swarm: Swarm) -> Non
 @pytest.mark.parametrize(
     ("file", "content", "sentence"),
     [
-        ("report.json", b"[1]", "Expected `object`, got `array`"),
+        ("report.json", b"[1]", "found no object, expected the figures of a run"),
         ("report.json", b"\xff\xfe", r"report\.json"),
         ("report.json", b"[" * 100_000, r"report\.json is damaged"),
         ("scenario.toml", b"seed = ", r"scenario\.toml"),
