@@ -178,12 +178,9 @@ def test_an_hour_of_kills_leaves_as_much_in_memory_as_minutes_of_them_and_no_cou
     assert live(660, 3600) < 1.1 * minutes
 
 
-def test_made_up_names_take_a_bounded_memory_and_known_ones_are_heard(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    observe = "launch_scripts.observe"
-    for limit in ("latest_messages._MOST_NAMES", "summed_counts._MOST_GENERATIONS"):
-        monkeypatch.setattr(f"{observe}.{limit}", 10)
+def test_made_up_names_take_a_bounded_memory_and_known_ones_are_heard(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("launch_scripts.observe.latest_messages._MOST_NAMES", 10)
+    monkeypatch.setattr("launch_scripts.observe.summed_counts._MOST_GENERATIONS", 10)
     latest = LatestState(plan_of(scenario(), 0), GRID)
 
     def hear_of(name: str, at_s: int) -> None:
