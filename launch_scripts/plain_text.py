@@ -1,14 +1,13 @@
 """The written form of texts, moments and durations for people, on a terminal, in a log and on a page.
 
-A moment is a time of day, `at 14:22:10`. A duration is a length of time, `for 19 min`. They are two types, so that
-no sentence says one for the other; a time after "since" would be neither.
+A moment is a time of day, `at 14:22:10`. A duration is a length of time, `for 19 min`. A time after "since" would
+be neither.
 """
 
 from __future__ import annotations
 
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
 
 from swarm.clock import NS_PER_S
 
@@ -19,31 +18,19 @@ _NAMED = 3
 """Names in a line for many: three ids fit 80 columns beside label, count and time."""
 
 
-@dataclass(frozen=True, slots=True, order=True)
-class Duration:
-    """A length of time."""
-
-    seconds: float
-
-    def __str__(self) -> str:
-        """Returns text such as 86 s, 19 min, 5 h 20 min."""
-        left = round(self.seconds)
-        if left < _SECONDS_UP_TO:
-            return f"{left} s"
-        unit, size, part, parts = next(each for each in _UNITS if left >= each[1])
-        many, rest = divmod(left, size)
-        return f"{many} {unit}" + (f" {rest // parts} {part}" if part and rest >= parts else "")
+def said_duration(seconds: float) -> str:
+    """Returns a length of time, such as 86 s, 19 min, 5 h 20 min."""
+    left = round(seconds)
+    if left < _SECONDS_UP_TO:
+        return f"{left} s"
+    unit, size, part, parts = next(each for each in _UNITS if left >= each[1])
+    many, rest = divmod(left, size)
+    return f"{many} {unit}" + (f" {rest // parts} {part}" if part and rest >= parts else "")
 
 
-@dataclass(frozen=True, slots=True, order=True)
-class Moment:
-    """An instant, in ns since 1970."""
-
-    ns: int
-
-    def __str__(self) -> str:
-        """Returns text such as 14:22:10, by this machine's local time."""
-        return time.strftime("%H:%M:%S", time.localtime(self.ns // NS_PER_S))
+def said_moment(ns: int) -> str:
+    """Returns an instant, in ns since 1970, by this machine's local time: 14:22:10."""
+    return time.strftime("%H:%M:%S", time.localtime(ns // NS_PER_S))
 
 
 def number_of(number: int, thing: str) -> str:

@@ -7,6 +7,7 @@ import math
 import time
 from dataclasses import dataclass
 from fnmatch import fnmatch
+from functools import cached_property
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -18,10 +19,11 @@ from launch_scripts.commands.terrain_routes import DescribedRoute, metres_along,
 from launch_scripts.observe.run_observer import ask_run, frame_of_run
 from shared_map.terrain.map_frame import MapFrame
 from swarm.bus.bus import Bus
+from swarm.client.route import Route as DrivenRoute
+from swarm.client.terrain_frame import Frame
 from swarm.config.explain import choice
 from swarm.config.vehicle_classes import GROUND
 from swarm.errors import BusError, ConfigError, TerrainError
-from swarm.grid import walk
 from swarm.places import Place, cell_of, fields_of, written
 from swarm.runtime.operator import AGAIN_S, replies_to
 from swarm.wire.access import OPERATOR
@@ -61,15 +63,18 @@ class Answer:
         """The only route of the reply."""
         return self.reply.routes[0]
 
-    @property
-    def searching(self) -> bool:
-        """True if the target is unseen: then the route leads to a cell to search."""
-        return self.route.status is RouteStatus.SEARCHING
+    @cached_property
+    def driven(self) -> DrivenRoute:
+        """The route as vehicles get it. Raises BusError if it leads over cells that are none."""
+        try:
+            return DrivenRoute.of(Frame(self.frame.grid), self.route, self.reply)
+        except ValueError as error:
+            raise BusError(f"the planner's route is none: {error}") from error
 
     @property
     def goal(self) -> int | None:
-        """End of the route; None if the planner does not state it."""
-        return self.target_cell if not self.searching else next(reversed(self.path()), None)
+        """End of the route, of a search the cell to search; None if the planner does not state it."""
+        return next(reversed(self.driven.cells), None) if self.driven.searching else self.target_cell
 
     @property
     def target_cell(self) -> int | None:
@@ -79,17 +84,8 @@ class Answer:
 
     def path(self) -> list[int]:
         """The cells of the route, of a pulled one those in which it turns; none without one."""
-        route = self.route
-        if not _leads(route):
-            return []
-        cells = walk(self.frame.grid, route.start, route.directions)
-        return [cells[turn] for turn in route.turns] if route.turns else cells
-
-
-def _leads(route: Route) -> bool:
-    """Returns True if a path exists: to the target, or to a cell where it is searched for."""
-    searching = route.status is RouteStatus.SEARCHING and math.isfinite(route.cost_s)
-    return searching or route.status is RouteStatus.OK
+        cells, turns = self.driven.cells, self.driven.turns
+        return [cells[turn] for turn in turns or range(len(cells))]
 
 
 def ask_planner(bus: Bus, where: object, target: str, start: Place, vehicle_class: str = GROUND) -> Answer:
@@ -161,8 +157,8 @@ def as_json(answer: Answer) -> str:
     fields["crs"] = frame.grid.crs
     fields["from"] = fields_of(frame, answer.start)
     fields["to"] = None if goal is None else fields_of(frame, goal)
-    fields["searching"] = answer.searching
-    if answer.searching:
+    fields["searching"] = answer.driven.searching
+    if answer.driven.searching:
         fields["last_seen"] = None if last is None else fields_of(frame, last)
     if cells:
         route = _route(answer, cells)
@@ -186,7 +182,7 @@ def _route(answer: Answer, cells: list[int]) -> DescribedRoute:
     path = np.array(cells, np.int64)
     route = answer.route
     return DescribedRoute(
-        name=f"{'in search of' if answer.searching else 'to'} {answer.reply.target}",
+        name=f"{'in search of' if answer.driven.searching else 'to'} {answer.reply.target}",
         grid=grid,
         cells=path,
         cost_s=route.cost_s,
@@ -209,7 +205,7 @@ def show(answer: Answer) -> None:
     if reply.lethal_target is not None:
         typer.echo(_lethal(answer))
         return
-    if not _leads(found):
+    if not answer.driven.cells:
         meaning = {
             RouteStatus.UNREACHABLE: "there is no way from there",
             RouteStatus.OUTSIDE: f"the cell is outside the terrain of {reply.rows} x {reply.cols} cells",
@@ -223,7 +219,7 @@ def show(answer: Answer) -> None:
         f"proven to be at most {found.gap - 1:.2%} above the optimum" if math.isfinite(found.gap) else "gap unknown"
     )
     typer.echo(f"from {written(answer.frame, answer.start)}")
-    if found.status is RouteStatus.SEARCHING:
+    if answer.driven.searching:
         goal = answer.goal
         place = "where this leads" if goal is None else written(answer.frame, goal)
         typer.echo(f"searching: {reply.target} is unseen; {place} is a place to search, in {found.cost_s:.1f} s")

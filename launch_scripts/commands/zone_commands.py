@@ -15,7 +15,7 @@ import typer
 from launch_scripts.commands.order_commands import print_obeyed
 from launch_scripts.commands.shared_options import AsJson, Where, duration
 from launch_scripts.observe.run_observer import frame_of_run
-from launch_scripts.plain_text import Duration
+from launch_scripts.plain_text import said_duration
 from launch_scripts.typer_commands import command, family_app
 from shared_map.terrain.map_frame import MapFrame
 from swarm.config.ground import ZoneConfig
@@ -170,7 +170,7 @@ def _fields(zones: Zones, frame: MapFrame) -> dict[str, object]:
 def _line(zone: Zone, frame: MapFrame) -> str:
     row0, col0, row1, col1 = zone.window
     kind = "lethal" if zone.pace_s_per_m is None else f"pace {zone.pace_s_per_m:g} s/m"
-    left = "" if zone.until_ns is None else f", ends in {Duration(max(zone.until_ns / 1e9 - time.time(), 0))}"
+    left = "" if zone.until_ns is None else f", ends in {said_duration(max(zone.until_ns / 1e9 - time.time(), 0))}"
     within = f"{zone.cells} cells in rows {row0}-{row1 - 1}, cols {col0}-{col1 - 1}"
     ends = " to ".join(written(frame, cell) for cell in _ends(zone, frame))
     whom = "" if zone.vehicle_class is None else f" for {zone.vehicle_class}"

@@ -20,7 +20,7 @@ from pathlib import Path
 import msgspec
 
 from launch_scripts.observe.latest_messages import LatestState
-from launch_scripts.plain_text import Duration, Moment, plain
+from launch_scripts.plain_text import plain, said_duration, said_moment
 from swarm.clock import NS_PER_S
 from swarm.peers import job_of
 from swarm.wire.messages.processes import Alarm as WireAlarm
@@ -105,7 +105,7 @@ class Alarm:
     @property
     def when(self) -> str:
         """In words: `for 19 min`, `at 14:22:10`, `at 14:22:10, for 86 s`."""
-        lasted = None if self.lasted_s is None else Duration(self.lasted_s)
+        lasted = None if self.lasted_s is None else said_duration(self.lasted_s)
         if self.over_s is not None:
             if self.since_s is None:
                 return f"until {self._at(self.over_s)}"
@@ -115,8 +115,8 @@ class Alarm:
 
     def _at(self, run_s: float) -> str:
         if self.began_ns is None:
-            return f"{Duration(run_s)} of the run"
-        return str(Moment(self.began_ns + round(run_s * NS_PER_S)))
+            return f"{said_duration(run_s)} of the run"
+        return said_moment(self.began_ns + round(run_s * NS_PER_S))
 
     @property
     def where(self) -> str:

@@ -15,18 +15,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from launch_scripts.observe.summed_counts import Counts, sum_of
-from shared_map.replication.marks import is_tombstone, supersedes
-from shared_map.replication.merge import winners
+from shared_map.replication.author_limits import Capacity
+from shared_map.replication.held_sets import HeldSets
+from shared_map.replication.marks import is_tombstone
+from shared_map.replication.merge import TileChange, new_winners
 from swarm.clock import NS_PER_S
 from swarm.config.scenario import Scenario, agent_of, crew_of
-from swarm.grid import TILE_CELLS, GridSpec
-from swarm.peers import FOR_GOOD_NS, HIGHEST_RANK, Newest, Peer, ranked_id, split_rank
-from swarm.right_of_way.generations import keep_last
+from swarm.grid import GridSpec
+from swarm.peers import FOR_GOOD_NS, HIGHEST_RANK, Newest, Peer, Roster, ranked_id, split_rank
 from swarm.runtime.order_book import OrderBook
 from swarm.runtime.stats import ENDED
 from swarm.runtime.tracker_ownership import Trackings
 from swarm.wire.messages import Message
-from swarm.wire.messages.map_data import MarkKind, MarkSet, owner_of
+from swarm.wire.messages.map_data import MarkSet, owner_of
 from swarm.wire.messages.orders import GoalState, GoalStates, Orders
 from swarm.wire.messages.planning import PlannerStatus, TargetPose
 from swarm.wire.messages.processes import Heartbeat, RunInfo, Stats
@@ -40,10 +41,6 @@ _VEHICLES_LAST_NS = 3 * NS_PER_S
 """A vehicle whose agent raises no liveliness token is there for this long after its last word."""
 _MOST_NAMES = 1 << 14
 """Processes, targets and authors that are remembered, of each: on loopback any program may use any name."""
-_MOST_SETS = 1 << 17
-"""Sets of marks that are remembered: enough for eight authors on each tile of 4096 x 4096 cells."""
-_MOST_TOMBSTONES = 64
-"""Number of ended sets that are remembered: an older one which is on its way comes in seconds. Chosen."""
 _ODD_POSES = ("poses_refused", "poses_outside")
 """Counts of planners: poses which do not count."""
 
@@ -176,9 +173,9 @@ class MarkedCells(NamedTuple):
     stamps_ns: NDArray[np.int64]
 
 
-def _remember(known: dict[K, V], key: K, value: V, most: int | None = None) -> None:
-    """Keeps the newest value of a key. A new key is ignored once `most` are known (`_MOST_NAMES` if None)."""
-    if key in known or len(known) < (most or _MOST_NAMES):
+def _remember(known: dict[K, V], key: K, value: V) -> None:
+    """Keeps the newest value of a key. A new key is ignored once `_MOST_NAMES` are known."""
+    if key in known or len(known) < _MOST_NAMES:
         known[key] = value
 
 
@@ -219,22 +216,19 @@ class LatestState(Counts):
         """Detection of reports that are newer than the last of an agent's vehicles in a region."""
         self._vehicles: VehicleColumns | None = None
         """The vehicles of `_fleets`, once asked for; None since the last news."""
-        self._marks: dict[tuple[str, int], MarkSet] = {}
-        """(author, tile) -> its set, until a keeper says that nothing of it is left."""
-        self._tombstones: dict[tuple[str, int], MarkSet] = {}
-        """(author, tile) -> these last words of keepers, the newest: an older set may still be on its way."""
+        self._sets = HeldSets(grid, Capacity())
+        """The statements of authors about cells, each until a keeper says that it is deleted."""
         self._ranks: dict[tuple[str, str], int] = {}
         """(role, job) -> rank of the process that leads, where there are standbys."""
         self._beats = Newest(silence_ns=FOR_GOOD_NS)
         """Detection of heartbeats which are newer than the last of their sender: copies change nothing."""
-        self._alive: dict[tuple[str, str], set[int]] = {}
-        """(role, id) -> incarnations whose token is up; empty for a process that was alive, of those that published
-        counts or that the observer started."""
+        self._alive = Roster()
         self._started: dict[tuple[str, str], set[int]] = {}
-        """(role, id) -> incarnations of the processes that the observer itself has started: the newest, and those
-        whose token was still up then."""
+        """(role, id) -> incarnations of the processes that the observer itself has started: the newest, and the one
+        whose token was up then."""
         self._told_ns: dict[tuple[str, str], int] = {}
-        """(role, id) -> time of the process's last counts, or of its first token."""
+        """(role, id) -> time of the last counts or of the newest token, of a process that is or was alive; one that
+        has ended is kept if it published counts, or if the observer started it."""
         self._fleet_told_ns: dict[str, int] = {}
         """Agent -> time of its last message about vehicles."""
 
@@ -244,7 +238,8 @@ class LatestState(Counts):
         match message:
             case Stats():
                 self.count(message)
-                _remember(self._told_ns, (message.role, message.id), now_ns)
+                if (key := (message.role, message.id)) in self._told_ns:
+                    self._told_ns[key] = now_ns
             case PlannerStatus():
                 # Only the planner that leads tells one, and a standby that takes over may be the older process.
                 _remember(self.status, message.target, message)
@@ -268,15 +263,13 @@ class LatestState(Counts):
             case TargetPose():
                 self.moved_ns = max(self.moved_ns, now_ns)
                 return self._trackings.counted(message, now_ns)
-            case MarkSet():
-                of = (message.author, message.tile)
-                marks = self._marks.get(of) or self._tombstones.get(of)
-                if marks is None or supersedes(message, marks):
+            case MarkSet() if not self._sets.off_grid(message):
+                if self._sets.is_news(message, self._sets.get(message.tile, message.author)):
                     if is_tombstone(message):
-                        self._marks.pop(of, None)
-                        keep_last(self._tombstones, of, message, _MOST_TOMBSTONES)
+                        self._sets.delete(message, now_ns)
+                        self._sets.tombstones.expire(now_ns)
                     else:
-                        _remember(self._marks, of, message, _MOST_SETS)
+                        self._sets.put(message)
             case GoalStates(states=states):
                 for each in states:
                     _remember(self._goals, each.name, each)
@@ -288,24 +281,19 @@ class LatestState(Counts):
         """Notes a generation that the observer itself has started. A token under the same name that is none of
         these is of another run, as at the port that all have by default."""
         key = (peer.role, peer.id)
-        self._started[key] = {peer.incarnation, *self._alive.get(key, ())}
+        self._started[key] = {peer.incarnation, self._alive.alive(peer.role).get(peer.id, peer.incarnation)}
 
     def alive(self, peer: Peer, up: bool, now_ns: int) -> None:
         """Notes that a liveliness token appeared (`up`) or ended."""
         self.touch(now_ns)
         key = (peer.role, peer.id)
-        if peer.incarnation not in self._started.get(key, (peer.incarnation,)):
-            return
-        if up:
-            if key not in self._alive and len(self._alive) >= _MOST_NAMES:
-                return
-            self._alive.setdefault(key, set()).add(peer.incarnation)
-            self._told_ns[key] = now_ns
-        elif key in self._alive:
-            self._alive[key].discard(peer.incarnation)
-            if not self._alive[key] and key not in self._newest and key not in self._started:
-                del self._alive[key]  # of a stranger, whose names must not fill the place of others
-                self._told_ns.pop(key, None)
+        if not up:
+            self._alive.gone(peer)
+            if not self._alive.is_alive(*key) and key not in self._newest and key not in self._started:
+                self._told_ns.pop(key, None)  # of a stranger, whose names must not fill the place of others
+        elif peer.incarnation in self._started.get(key, (peer.incarnation,)):
+            self._alive.appeared(peer)
+            _remember(self._told_ns, key, now_ns)
 
     def touch(self, now_ns: int) -> None:
         """Notes the time of a message of the run, or of its end."""
@@ -321,15 +309,15 @@ class LatestState(Counts):
 
     def up(self) -> list[tuple[str, str]]:
         """(role, id) of all processes which are alive now."""
-        return sorted(key for key, incarnations in self._alive.items() if incarnations)
+        return self._alive.up()
 
     def is_up(self, role: str, job: str) -> bool:
         """Returns True if the process with this job or one of its standbys is alive."""
-        return any(self._alive.get((role, ranked_id(job, rank))) for rank in range(HIGHEST_RANK + 1))
+        return any(self._alive.is_alive(role, ranked_id(job, rank)) for rank in range(HIGHEST_RANK + 1))
 
     def was_up(self, role: str, id: str) -> bool:
         """Returns True if the process is or was alive; one that has ended is forgotten if it published nothing."""
-        return (role, id) in self._alive
+        return (role, id) in self._told_ns
 
     def knows(self, role: str, id: str) -> bool:
         """Returns True if the process has ever been seen alive, or its counts are known."""
@@ -343,19 +331,19 @@ class LatestState(Counts):
 
     def is_well(self, role: str, id: str) -> bool:
         """Returns True if a process is in order: alive, or ended on request."""
-        return bool(self._alive.get((role, id))) or self.has_ended(role, id)
+        return self._alive.is_alive(role, id) or self.has_ended(role, id)
 
     def has_ended(self, role: str, id: str) -> bool:
         """Returns True if a process ended on request."""
         stats = self.newest_stats(role, id)
-        return stats is not None and stats.gauges.get(ENDED, 0.0) > 0 and not self._alive.get((role, id))
+        return stats is not None and stats.gauges.get(ENDED, 0.0) > 0 and not self._alive.is_alive(role, id)
 
     def fills(self, role: str, id: str) -> bool:
         """Returns True if the job of this process is done in order: by itself, or by a keeper or a targets process
         of another name, as when it was started by hand."""
         if self.is_well(role, id) or role not in ("keeper", "targets") or split_rank(id)[1]:
             return self.is_well(role, id)
-        known = {each for each_role, each in (*self._alive, *self._newest) if each_role == role}
+        known = {each for each_role, each in (*self._told_ns, *self._newest) if each_role == role}
         return any(self.is_well(role, each) for each in known if not split_rank(each)[1])
 
     def silent(self, before_ns: int) -> list[tuple[str, str, int]]:
@@ -364,12 +352,12 @@ class LatestState(Counts):
         return [
             (*key, told_ns)
             for key, told_ns in sorted(self._told_ns.items())
-            if told_ns < before_ns and self._alive.get(key) and key in self._newest
+            if told_ns < before_ns and self._alive.is_alive(*key) and key in self._newest
         ]
 
     def now_of(self, name: str) -> float | None:
         """A gauge, summed over the processes which are alive; None if none of them has published it."""
-        return sum_of(stats.gauges.get(name) for key, stats in self.newest().items() if self._alive.get(key))
+        return sum_of(stats.gauges.get(name) for key, stats in self.newest().items() if self._alive.is_alive(*key))
 
     def rank(self, role: str, job: str) -> int:
         """Rank of the process that leads."""
@@ -431,9 +419,9 @@ class LatestState(Counts):
         return vehicles.only(np.array([drives[agent] for agent in agents], bool))
 
     def _drives(self, agent: str, of_crew: bool, now_ns: int) -> bool:
-        if self._alive.get(("agent", agent)):
+        if self._alive.is_alive("agent", agent):
             return True
-        if self.newest_stats("agent", agent) is not None or self.was_up("agent", agent):
+        if self.knows("agent", agent):
             return of_crew and self.is_well("agent", agent)
         return now_ns - self._fleet_told_ns.get(agent, 0) <= _VEHICLES_LAST_NS  # it raises no token
 
@@ -477,23 +465,13 @@ class LatestState(Counts):
     def learned_words(self) -> list[MarkSet]:
         """Returns the measured factors of kinds of ground, by author. They are stored as one extra tile, after the
         map's last."""
-        return [marks for (_, tile), marks in sorted(self._marks.items()) if tile == self.grid.tiles]
+        return self._sets.of_tile(self.grid.tiles)
 
     def marked(self) -> MarkedCells:
         """Returns the current mark of each cell, as the shared map merges it; cells cleared again are left out."""
-        of_tile: dict[int, list[MarkSet]] = {}
-        for (_, tile), marks in sorted(self._marks.items()):
-            if tile < self.grid.tiles:
-                of_tile.setdefault(tile, []).append(marks)
-        types = (np.int64, np.uint8, np.float32, np.int64)
-        found = [MarkedCells._make(np.zeros(0, type) for type in types)]
-        for tile, sets in of_tile.items():
-            window, stated = self.grid.tile_window(tile), winners(sets, self.moved_ns)
-            rows, cols = np.divmod(stated.cells.astype(np.int64), TILE_CELLS)
-            rows, cols = rows + window.row0, cols + window.col0
-            kept = (stated.kinds != MarkKind.CLEAR) & (rows < window.row1) & (cols < window.col1)
-            columns = (rows * self.grid.cols + cols, stated.kinds, stated.paces, stated.stamps_ns)
-            found.append(MarkedCells._make(each[kept] for each in columns))
-        joined = [np.concatenate(each) for each in zip(*found, strict=True)]
-        order = np.argsort(joined[0])
-        return MarkedCells._make(each[order] for each in joined)
+        tiles = [tile for tile in self._sets.tiles if tile < self.grid.tiles]
+        changes = [TileChange(tile, (), self._sets.of_tile(tile)) for tile in tiles]
+        won = new_winners(self.grid, changes, 0, self.moved_ns)
+        order = np.argsort(won.cells)
+        cells = won.cells[order].astype(np.int64)
+        return MarkedCells(cells, won.kinds[order], won.paces[order], won.stamps_ns[order])

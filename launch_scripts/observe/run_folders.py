@@ -27,7 +27,7 @@ from typing import Annotated, Any
 import msgspec
 import psutil
 
-from swarm.config.input_files import FileKind, read_text
+from swarm.config.input_files import FileKind, read_bytes, read_text
 from swarm.config.scenario import Scenario
 from swarm.config.scenario_files import scenario_text
 from swarm.errors import ConfigError, StoreError, SwarmError
@@ -143,7 +143,7 @@ def _entries() -> Iterator[tuple[Path, _Entry]]:
                 files += [(file.lstat().st_mtime_ns, file)] if not file.name.endswith(".part.json") else []
     for _, file in sorted(files, reverse=True):
         with suppress(OSError, SwarmError, msgspec.MsgspecError, RecursionError):
-            yield file, msgspec.json.decode(read_text(file, FileKind.RUN), type=_Entry)
+            yield file, msgspec.json.decode(read_bytes(file, FileKind.RUN), type=_Entry)
 
 
 def _started_s(pid: int) -> float:
@@ -248,11 +248,9 @@ def ended(folder: Path) -> dict[str, Any]:
 
 def run_facts(folder: Path) -> dict[str, Any]:
     """Returns the content of `run.json`; empty if it cannot be read."""
-    try:
-        facts = json.loads(read_text(folder / RUN_FILE, FileKind.RUN))
-    except (SwarmError, OSError, ValueError, RecursionError):
-        return {}
-    return facts if isinstance(facts, dict) else {}
+    with suppress(SwarmError, OSError, msgspec.MsgspecError, RecursionError):
+        return msgspec.json.decode(read_bytes(folder / RUN_FILE, FileKind.RUN), type=dict[str, Any])
+    return {}
 
 
 def point_last(folder: Path) -> str | None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import itertools
 import time
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from typing import Protocol
@@ -62,8 +62,6 @@ _GONE, _RUN = "observer-gone", "observer-run"
 _ASK_EVERY_NS, _ASK_TIMEOUT_S = 5 * NS_PER_S, 1.0
 _EVENTS_AT_ONCE = 5000
 """Taken in at most when the time to listen is over: the caller has something to show."""
-_EARLY = 100_000
-"""Messages kept at most until a run is known."""
 _LEARNED_TIMEOUT_S = 2.0
 """A process without a reply for this time counts as ended (`network.lease_s`), and a keeper replies from memory."""
 
@@ -152,8 +150,8 @@ class RunObserver:
 
 
 class OutsideObserver(RunObserver):
-    """Observes whatever run is in a namespace, without its scenario. Messages before the replies of its members are
-    kept, and applied then: only members know the terrain of poses.
+    """Observes whatever run is in a namespace, without its scenario. It subscribes once processes have
+    replied: only members of a run know the terrain of poses.
 
     latest   the newest of the run; None before its members have answered
     answers  what each process has answered last, of whatever run; routers belong to none
@@ -175,19 +173,15 @@ class OutsideObserver(RunObserver):
         """True if all processes that reply belong to another run by now; never reset."""
         self.answers: dict[tuple[str, str], RunInfo] = {}
         self._follows = follows
-        self._early: deque[tuple[Event, int]] = deque(maxlen=_EARLY)
-        """Events before a run is known, each with its time."""
         self._up: set[Peer] = set()
         self._round: list[RunInfo] = []
-        self._ask_due_ns = 0
-        self._asking = False
-        self.subscribe()
-        self.ask_gone()
+        self._ask_due_ns: int | None = 0
+        """Time of the next question; None while one is under way."""
 
     def tick(self, now_ns: int) -> None:
         """Queries the processes of the run, if it is time to. Call it often."""
-        if now_ns >= self._ask_due_ns and not self._asking:
-            self._asking = True
+        if self._ask_due_ns is not None and now_ns >= self._ask_due_ns:
+            self._ask_due_ns = None
             self._bus.ask(wire_topics.RUN, Nothing(), self._post, tag=_RUN, timeout_s=_ASK_TIMEOUT_S)
 
     def listen(self, clock: Clock, for_s: float) -> None:
@@ -209,7 +203,7 @@ class OutsideObserver(RunObserver):
                 self._round.append(info)
             case AskEnded(tag="observer-run"):
                 self._go_by(self._round, now_ns)
-                self._round, self._asking, self.answered = [], False, True
+                self._round, self.answered = [], True
                 self._ask_due_ns = now_ns + (_ASK_EVERY_NS if self.run is not None else 0)
             case _:
                 if isinstance(event, Appeared):
@@ -217,8 +211,6 @@ class OutsideObserver(RunObserver):
                 elif isinstance(event, Disappeared):  # it may have ended before it published any counts to us
                     self._up.discard(event.peer)
                     self.ask_gone()
-                if self.run is None:
-                    self._early.append((event, now_ns))
                 super().take(event, now_ns)
 
     def members(self) -> tuple[list[RunInfo], list[RunInfo]]:
@@ -260,27 +252,26 @@ class OutsideObserver(RunObserver):
                 return
         if not answers:
             return
+        if self.latest is None:
+            self.subscribe()
         self.answers = {(info.role, info.id): info for info in answers}
         members, _ = self.members()
         frame = frame_of_members(members)
         grid = GridSpec(1, 1, 1.0) if frame is None else frame.grid
         latest = self.latest = self._known = LatestState(plan_of_members(members), grid)
-        for event, at_ns in self._early:
-            super().take(event, at_ns)
-        if self.run is not None:
-            for peer in self._up:
-                latest.alive(peer, True, now_ns)
+        for peer in self._up:
+            latest.alive(peer, True, now_ns)
+        self.ask_gone()
         if members[0].run_id:
             self.run = members[0]
-            self._early.clear()
 
 
 # --- who takes part, and where ------------------------------------------------------------------------------------
 
 
-def ask_run(bus: Bus, timeout_s: float = _ASK_TIMEOUT_S, *, routers: bool = False) -> list[RunInfo]:
+def ask_run(bus: Bus, *, routers: bool = False) -> list[RunInfo]:
     """Members of the run in the namespace, as each answers for itself; with `routers` those, too."""
-    replies, _ = replies_to(bus, wire_topics.RUN, Nothing(), timeout_s)
+    replies, _ = replies_to(bus, wire_topics.RUN, Nothing(), _ASK_TIMEOUT_S)
     return [each for each in replies if isinstance(each, RunInfo) and (routers or each.run_id != NO_RUN)]
 
 

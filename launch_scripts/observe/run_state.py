@@ -19,7 +19,7 @@ import numpy as np
 from launch_scripts.observe.alarms import Alarm, alarms_of, kind_of, starts
 from launch_scripts.observe.latest_messages import LatestState, VehicleColumns
 from launch_scripts.observe.summed_counts import CertifiedGap, certified_gap, gap_text, gaps_to, percent
-from launch_scripts.plain_text import Duration, first_of, number_of, plain
+from launch_scripts.plain_text import first_of, number_of, plain, said_duration
 from swarm.clock import NS_PER_S
 from swarm.config.explain import hints_of
 from swarm.config.vehicle_classes import GROUND
@@ -41,7 +41,7 @@ def count(value: float | None) -> str:
 
 def seconds(value: float | None) -> str:
     """Returns text such as 34 s, 19 min."""
-    return NONE if value is None else str(Duration(value))
+    return NONE if value is None else said_duration(value)
 
 
 def distance(value_m: float) -> str:
@@ -151,7 +151,7 @@ class TargetLine:
         """The id, and exceptional states of its tracker and its planner."""
         unusual = []
         if self.lost:
-            unusual.append("lost" if self.pose_age_s is None else f"lost for {Duration(self.pose_age_s)}")
+            unusual.append("lost" if self.pose_age_s is None else f"lost for {said_duration(self.pose_age_s)}")
         if not self.planner_up:
             unusual.append("planner starting" if self.starting else "planner down")
         elif self.rank:
@@ -438,7 +438,7 @@ def verdict(report: Mapping[str, Any], failures: Sequence[str] = ()) -> str:
     reached += [] if collisions is None else [number_of(collisions, "collision")]
     forbidden = [f"{fact(name).label} {count(report[name])}" for name in MUST_BE_ZERO[:-1] if report.get(name)]
     serious = [
-        alarm["text"] + (f" for {Duration(alarm['over_s'] - alarm['since_s'])}" if alarm["over_s"] else "")
+        alarm["text"] + (f" for {said_duration(alarm['over_s'] - alarm['since_s'])}" if alarm["over_s"] else "")
         for alarm in report.get("alarms") or []
         if kind_of(alarm["kind"]).serious and (alarm["over_s"] is None or alarm["kind"] == "silent")
     ]

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from typing import NamedTuple
 
-from launch_scripts.plain_text import Duration
+from launch_scripts.plain_text import said_duration
 from launch_scripts.web import PROBED, READY, Page, Reply
 from swarm.clock import NS_PER_S
 from swarm.runtime.loop_health import Phase, Vitals
@@ -34,7 +34,7 @@ class Process(NamedTuple):
         if self.vitals is None:
             return "starts", None, ("its start",)
         if self.vitals.hangs(now_ns):
-            wrong = f"its loop hangs for {Duration((now_ns - self.vitals.stamp_ns) / NS_PER_S)}"
+            wrong = f"its loop hangs for {said_duration((now_ns - self.vitals.stamp_ns) / NS_PER_S)}"
             return "hangs", wrong, (wrong,)
         return self.vitals.phase.name.lower(), None, self.vitals.lacks
 

@@ -158,6 +158,11 @@ def test_of_a_search_the_place_to_look_at_is_told_and_the_last_sighting(capsys: 
     assert "t3 is unseen; cell:8,13" in capsys.readouterr().out
 
 
+def test_a_route_that_leaves_the_terrain_is_a_fault_of_its_planner() -> None:
+    with pytest.raises(BusError, match=r"the planner's route is none: "):
+        show(answer(RouteStatus.SEARCHING, **{**WAY, "directions": bytes([0] * 60)}))
+
+
 def test_the_frame_is_that_of_most_processes() -> None:
     def info(id: str, crs: str, rows: int = 60) -> RunInfo:
         return run_info(GridSpec(60, 80, 20.0, 500_000.0, 5_200_000.0, crs), id=id, rows=rows)

@@ -22,7 +22,7 @@ from launch_scripts.monitor.terrain_mesh import TerrainMesh
 from launch_scripts.observe.alarms import KINDS, Alarm
 from launch_scripts.observe.latest_messages import LatestState, RunPlan, VehicleColumns
 from launch_scripts.observe.run_state import state_of
-from launch_scripts.plain_text import Duration
+from launch_scripts.plain_text import said_duration
 from swarm.clock import NS_PER_S
 from swarm.config.scenario_files import parse_scenario
 from swarm.grid import GridSpec, walk
@@ -336,4 +336,4 @@ def test_no_message_says_since_and_a_number_of_seconds() -> None:
     texts = [path for path in files if path.suffix in (".py", ".js", ".j2", ".json", ".yml")]
     assert len(texts) > 300
     assert [path for path in texts if since.search(path.read_text(encoding="utf-8"))] == []
-    assert [str(Duration(s)) for s in (86, 1140, 19_200, 90_000)] == ["86 s", "19 min", "5 h 20 min", "1 d 1 h"]
+    assert [said_duration(s) for s in (86, 1140, 19_200, 90_000)] == ["86 s", "19 min", "5 h 20 min", "1 d 1 h"]

@@ -261,11 +261,11 @@ def outside(*, follows: bool = False) -> OutsideObserver:
 COUNTED = stats(stamp_ns=2, counts={"captures": 1})
 
 
-def test_what_was_heard_before_the_members_answered_is_part_of_the_run() -> None:
+def test_a_run_is_whole_once_each_process_that_answered_has_said_how_it_is() -> None:
     observer = outside()
+    answered(observer, "r1")
     observer.take(Heard(FLEET, {}, fleet(100.0, ("a0-00", 1))), 5)
     observer.take(Appeared(Peer("agent", "a0", 1)), 6)
-    answered(observer, "r1")
     latest = observer.latest
     assert latest.grid.rows == 4
     assert latest.vehicles().ids == ["a0-00"]
