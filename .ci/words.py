@@ -1,14 +1,15 @@
 """Checks the English of the product: `python .ci/words.py`, exit code 1 with a sentence per fault.
 
 - A docstring begins with a noun phrase or a verb in the third person: no word of `FIRST` begins one.
-- No word of `BANNED` occurs in a docstring, a comment, a page or the name of a test: the vocabulary has a term for
-  each.
+- No word of `BANNED` occurs in a text of the product, such as a docstring, a help or an error, nor in a comment, a
+  page or the name of a test: each has a plain term.
 
 `budget.toml` holds in `[words]` how many faults each tree may still have. A row only falls.
 """
 
 from __future__ import annotations
 
+import ast
 import io
 import re
 import sys
@@ -37,6 +38,13 @@ def comments(source: str) -> Iterator[tuple[int, str]]:
             yield token.start[0], token.string
 
 
+def texts_of(source: str) -> Iterator[tuple[int, str]]:
+    """Yields the line and the words of each string, parts of formatted ones among them."""
+    for node in ast.walk(ast.parse(source)):
+        if isinstance(node, ast.Constant) and isinstance(node.value, str):
+            yield node.lineno, node.value
+
+
 def names_of_tests(source: str) -> Iterator[tuple[int, str]]:
     """Yields the line and the words of each test's name."""
     for found in re.finditer(r"^ *(?:async )?def test_(\w+)", source, re.M):
@@ -54,10 +62,11 @@ def faults_of(path: Path) -> Iterator[str]:
         for line, each in first:
             if found := FIRST.match(each.strip()):
                 yield f'{where}:{line}: a docstring begins with "{found[0]}": begin with a noun phrase or a verb'
-        texts = [*first, *comments(text), *names_of_tests(text)]
+        own = first if where.parts[0] == "tests" else texts_of(text)
+        texts = [*own, *comments(text), *names_of_tests(text)]
     for line, each in texts:
         for found in BANNED.finditer(_CODE.sub("`", each)):
-            yield f'{where}:{line}: "{found[0]}": the style page has a plain term for it'
+            yield f'{where}:{line}: "{found[0]}": there is a plain term for it'
 
 
 def main() -> int:
@@ -65,7 +74,9 @@ def main() -> int:
     rows = tomllib.loads((ROOT / "budget.toml").read_text(encoding="utf-8"))["words"]
     over = False
     for tree, most in rows.items():
-        paths = [path for path in sorted((ROOT / tree).rglob("*")) if path.suffix in (".py", ".md")]
+        root = ROOT / tree
+        paths = sorted(root.rglob("*")) if root.is_dir() else [root]
+        paths = [path for path in paths if path.suffix in (".py", ".md")]
         faults = [each for path in paths for each in faults_of(path)]
         if "--show" in sys.argv:
             print(f"{tree:20}{len(faults):6}")

@@ -27,6 +27,8 @@ box around all their finds is the whole map, and makes each reader look at every
 _MANY_BOXES = 2 * MAX_WINDOWS
 """Above this number of boxes around changed cells one box around all of them is kept: merging is quadratic in their
 number."""
+_FEW_PAIRS = 512
+"""Up to this number of pairs of boxes a list is faster than arrays."""
 
 
 class CostSnapshot(NamedTuple):
@@ -230,11 +232,36 @@ def cluster(cells: NDArray[np.int64], cols: int) -> list[Window]:
 
 
 def merged(windows: Iterable[Window], others: Iterable[Window] = ()) -> list[Window]:
-    """Merges windows, and others, which touch until none do; beyond MAX_WINDOWS all of them."""
-    apart = [window for window in (*others, *windows) if not window.empty]
-    if len(apart) < 2:  # as most often
-        return apart
-    boxes = np.array([(each.row0, each.col0, -each.row1, -each.col1) for each in apart], np.int64)
+    """Merges windows which touch until none do; beyond MAX_WINDOWS all of them.
+
+    others  windows of which none touch each other
+    """
+    apart, fresh = list(others), [window for window in windows if not window.empty]
+    if len(fresh) * (len(fresh) + len(apart)) > _FEW_PAIRS:
+        apart = _merged_as_arrays([*apart, *fresh])
+        fresh = []
+    for window in fresh:
+        while True:
+            row0, col0, row1, col1 = window.row0, window.col0, window.row1, window.col1
+            touching = [  # `touches`, without a call for each
+                n for n, other in enumerate(apart)
+                if row0 <= other.row1 and other.row0 <= row1 and col0 <= other.col1 and other.col0 <= col1
+            ]  # fmt: skip
+            if not touching:
+                break
+            window = window.union(apart.pop(touching[0]))
+        apart.append(window)
+    if len(apart) > MAX_WINDOWS:
+        whole = apart[0]
+        for window in apart[1:]:
+            whole = whole.union(window)
+        return [whole]
+    return apart
+
+
+def _merged_as_arrays(windows: Sequence[Window]) -> list[Window]:
+    """The same for many windows."""
+    boxes = np.array([(each.row0, each.col0, -each.row1, -each.col1) for each in windows], np.int64)
     while True:
         row0, col0, row1, col1 = boxes.T * np.array([[1], [1], [-1], [-1]])
         reach = (row0[:, None] <= row1) & (col0[:, None] <= col1)
@@ -244,8 +271,5 @@ def merged(windows: Iterable[Window], others: Iterable[Window] = ()) -> list[Win
         order = np.argsort(first, kind="stable")
         starts = np.flatnonzero(np.diff(first[order], prepend=-1))
         if len(starts) == len(boxes):
-            break
+            return [Window(*each) for each in np.stack((row0, col0, row1, col1), 1).tolist()]
         boxes = np.minimum.reduceat(boxes[order], starts, axis=0)
-    if len(boxes) > MAX_WINDOWS:
-        boxes = boxes.min(axis=0, keepdims=True)
-    return [Window(row0, col0, -row1, -col1) for row0, col0, row1, col1 in boxes.tolist()]

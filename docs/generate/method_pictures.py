@@ -97,7 +97,7 @@ def tree() -> Figure:
 
 
 def reversed_edges() -> Figure:
-    """Which of two targets is the cheapest, if the tree is grown along the edges, and against them."""
+    """The cheaper of two targets, if the tree is grown along the edges, and against them."""
     pace = np.ones((36, 60), np.float32)
     row, col = np.indices(pace.shape)
     pace[np.hypot(row - 18, col - 14) < 3.5] = 12.0
@@ -114,7 +114,7 @@ def reversed_edges() -> Figure:
         dearer = choice != driven.argmin(axis=0)
         if dearer.any():
             axes.contourf(dearer, levels=[0.5, 1.5], colors="none", hatches=["////"])
-            axes.text(24, 34, "hatched: sent to the dearer target", fontsize=8.5, color=INK)
+            axes.text(24, 34, "hatched: sent to the costlier target", fontsize=8.5, color=INK)
         taken = int(choice[vehicle])
         _draw_chase(axes, chases[taken].trail(vehicle), vehicle, places[taken])
         for place, colour, name in zip(places, (BLUE, ORANGE), ("A, in a swamp", "B"), strict=True):
@@ -126,7 +126,7 @@ def reversed_edges() -> Figure:
 
 
 def range_rule() -> Figure:
-    """How wide a window each move of a target gets, by the printed condition and by blocks that are left."""
+    """The width of the window of each move of a target, by the printed condition and by blocks that are left."""
     figure = Figure(figsize=(9.2, 3.5), layout="constrained")
     left, *right = figure.subplots(1, 3, width_ratios=[1.05, 1.2, 1.2])
     _draw_windows(left)
@@ -217,7 +217,7 @@ def _drive(chase: Chase, start: Place, way: Sequence[Place]) -> tuple[Trail, lis
 
 
 def schedule() -> Figure:
-    """How far every cell's route is from the optimum after a target has moved 120 cells."""
+    """The gap of the route of every cell after a target has moved 120 cells."""
     pace = _hills(160, 160, seed=3, strength=1.6)
     walls = gaussian_filter(np.random.default_rng(4).standard_normal(pace.shape), 5)
     pace[walls > 1.7 * walls.std()] = np.inf

@@ -220,6 +220,8 @@ def certs(
     chosen = Scenario() if scenario is None else find_scenario(scenario)
     given = {name: hosts for name, _, hosts in (each.partition("=") for each in names or ())}
     wanted = [*given, *(() if scenario is None else certificate_names(chosen))]
+    if not wanted:
+        raise ConfigError("found no NAME and no --scenario, expected one: they say whose certificates to make")
     for name in wanted:
         bearer(name)
     revoked = {*chosen.network.revoked, *revocations.revoked_in(folder)}

@@ -127,6 +127,10 @@ def export(
     from launch_scripts.report.run_gis_layers import ENDINGS, WHAT, export_run
 
     ending = "" if out is None or out.is_dir() else out.suffix.lower().removeprefix(".")
+    if ending and ending not in ENDINGS:
+        raise ConfigError(
+            f"--out: found {out}, expected a folder, or a file with an ending of {', '.join(ENDINGS)}"
+        )
     chosen = format or (ending if ending in ENDINGS else ENDINGS[0])
     for option, given, allowed in (("--what", what or (), tuple(WHAT)), ("--format", [chosen], ENDINGS)):
         for each in given:

@@ -22,6 +22,7 @@ from shared_map.terrain.map_frame import MapFrame, middles_of
 from shared_map.terrain.pace_layers import TerrainClass, nearest_open
 from shared_map.terrain.slope_and_climb import said_of_cost
 from shared_map.terrain.terrain import Terrain, build_terrain
+from shared_map.terrain.zones import closing_zones
 from swarm.config.scenario import PlannerConfig, Scenario
 from swarm.errors import ConfigError, TerrainError
 from swarm.grid import STEP_COL, STEP_ROW, GridSpec
@@ -83,6 +84,7 @@ class DescribedRoute:
             "length_m": round(self.length_m, 2),
             "steps": len(self.cells) - 1,
             **ups,
+            "rule": f"{gis_formats.COSTS} {self.rule}".strip(),
             "crs": self.grid.crs,
             "from": fields_of(frame, int(self.cells[0])),
             "to": fields_of(frame, int(self.cells[-1])),
@@ -107,7 +109,7 @@ def layers_of(route: DescribedRoute, ending: str) -> list[gis_formats.Layer]:
     if route.height_m is not None and np.isfinite(route.height_m).all():
         xy_m = np.column_stack([xy_m, route.height_m.round(2)])
     kinds: dict[type, gis_formats.FieldKind] = {str: "text", int: "int", float: "real", dict: "json", list: "json"}
-    values = {"name": route.name, **route.facts(), "rule": route.rule, "resolution_m": route.grid.resolution_m}
+    values = {"name": route.name, **route.facts(), "resolution_m": route.grid.resolution_m}
     if ending == ".geojson":
         values |= {name: each.tolist() for name, each in steps.items()}
     # A line has two points at least, even for a vehicle that is already there.
@@ -247,7 +249,10 @@ def _check_open(scenario: Scenario, terrain: Terrain, cell: int, option: str, ot
     kind = [*TerrainClass][terrain.classes.reshape(-1)[cell]].name.lower()
     seconds = terrain.pace_s_per_m if lethal[other] else finder_for(scenario, terrain, other).cost_to_go_s()
     told = f"{option} is on lethal ground, {written(frame, cell)}, class {kind}: no way leads there"
-    told += f"; ground above {scenario.cost.max_slope_deg:g} degrees is lethal (--preset, cost.max_slope_deg)"
+    if closing := closing_zones(scenario.cost, grid, cell):
+        told += f"; closed by {' and '.join(closing)} (cost.zones)"
+    else:
+        told += f"; ground above {scenario.cost.max_slope_deg:g} degrees is lethal (--preset, cost.max_slope_deg)"
     if (near := nearest_open(np.isfinite(seconds), *grid.row_col(cell))) is not None:
         told += f"; the nearest place that can be reached is {written(frame, grid.cell(*near))}"
     raise TerrainError(told)

@@ -222,7 +222,7 @@ class OutlivingOutput:
         except OSError as error:
             if error.errno not in _READER_GONE:
                 raise
-            log.info("nobody reads the terminal output any more; this log goes on")
+            log.info("the terminal output has no reader any more; this log goes on")
             discard_output(self._stream.fileno())
 
 
@@ -312,15 +312,13 @@ def columns(*labels: str) -> Table:
 
 def plain_line(state: RunState, title: str) -> str:
     """The state in one line."""
-    told = ", ".join(
-        facts.fact(name).labelled(state)
-        for name in ("captures", "reroute_requests", "marks", "messages_now_per_s", "certified_gap")
-    )
+    names = ("captures", "reroute_requests", "marks", "messages_now_per_s", "certified_gap")
+    told = "".join(f", {text}" for text in facts.measured(names, state))
     alarms = "".join(f"; {line}" for line in facts.alarm_lines(state, SHOWN_ALARMS))
     return (
         f"{title}: {facts.fact('processes_well').labelled(state)}, "
         f"restarts {state.restarts}; vehicles {facts.fact('vehicles_driven').shown(state)}: "
-        f"{facts.fact('states').shown(state)}; {told}{alarms}"
+        f"{facts.fact('states').shown(state)}{told}{alarms}"
     )
 
 

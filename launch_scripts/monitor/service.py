@@ -55,7 +55,7 @@ _ROUTES_SEEN_S = 0.5
 """Interval at which routes are taken for viewers."""
 _UNSEEN = 2
 """Without viewers every second frame is left out: frames are drawn for the recording only."""
-_EVERY_S = {"anew": 10.0, "figures": 1.0}
+_EVERY_S = {"redraw": 10.0, "figures": 1.0}
 """Shortest interval of complete redraws for new viewers, and the interval of metrics."""
 _ANSWER_S = 5.0
 """Longest wait for a planner's costs. A planner replies within 1 s, or states that it has no tree; the remainder is
@@ -203,7 +203,7 @@ class MonitorService(MemberService):
         self._frame += 1
         self._pen.set_time(self._frame, self.at_s)
         self._watch_recording(now_ns)
-        if viewers > self._drawn_for and self._limit.due("anew", now_ns):
+        if viewers > self._drawn_for and self._limit.due("redraw", now_ns):
             self._drawn_for = viewers
             self._pen.forget()
             self._ground.draw_anew()

@@ -346,9 +346,14 @@ MUST_BE_ZERO = ("collisions", "lethal_entries", "driven_into", "hit_by_obstacles
 """Facts that are shown only where they are not 0."""
 
 
+def measured(names: Iterable[str], state: RunState) -> list[str]:
+    """Those of some facts whose value is known, after their labels."""
+    return [fact(name).labelled(state) for name in names if fact(name).shown(state) != NONE]
+
+
 def lines(state: RunState) -> list[str]:
     """The facts of a run but its time, in lines for people: `label text` with two spaces between facts."""
-    found = ["  ".join(fact(name).labelled(state) for name in names) for names in LINES]
+    found = [line for names in LINES if (line := "  ".join(measured(names, state)))]
     if list(state.classes) not in ([], [GROUND]):
         found.insert(1, fact("classes").labelled(state))
     found += [fact(name).labelled(state) for name in IF_ANY if getattr(state, name)]

@@ -9,7 +9,7 @@ before and after.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from shared_map.replication.marks import NO_STATEMENT, NO_STATEMENTS, Statements, is_zone
 from shared_map.replication.tiles import grid_cells, tile_corners
-from swarm.grid import GridSpec
+from swarm.grid import TILE_CELLS, GridSpec
 from swarm.wire.fields import column
 from swarm.wire.messages.map_data import FOREVER, TILE_AREA, MarkKind, MarkSet
 
@@ -64,6 +64,9 @@ def new_winners(grid: GridSpec, changes: Sequence[TileChange], before_ns: int, n
 
     changes  each of another tile
     """
+    statements = sum([len(each.kinds) for change in changes for sets in change[1:] for each in sets])
+    if statements <= _FEW:
+        return _new_winners_of_few(grid, changes, before_ns, now_ns)
     before = _winners([(n, each) for n, change in enumerate(changes) for each in change.before], before_ns)
     after = _winners([(n, each) for n, change in enumerate(changes) for each in change.after], now_ns)
     changed = _changed(before, after)
@@ -72,6 +75,65 @@ def new_winners(grid: GridSpec, changes: Sequence[TileChange], before_ns: int, n
     cells = grid_cells(grid, corners[numbers], changed.places & (TILE_AREA - 1))
     counts = np.bincount(numbers, minlength=len(changes)).tolist()
     return NewWinners(cells, changed.kinds, changed.paces, changed.stamps_ns, counts)
+
+
+# --- few statements, as lists -----------------------------------------------------------------------------------
+
+
+def _new_winners_of_few(grid: GridSpec, changes: Sequence[TileChange], before_ns: int, now_ns: int) -> NewWinners:
+    """The same in Python lists and dicts."""
+    changed: list[tuple[int, int, float, int]] = []
+    counts: list[int] = []
+    for tile, sets_before, sets_after in changes:
+        before, after = _winners_of_few(sets_before, before_ns), _winners_of_few(sets_after, now_ns)
+        here: list[tuple[int, int, float, int]] = []
+        for cell, (kind, pace, stamp_ns) in after.items():
+            was = before.pop(cell, _NOTHING)
+            if kind != was[0] or pace != was[1]:
+                here.append((cell, kind, pace, stamp_ns))
+        here.extend((cell, *_NOTHING) for cell, was in before.items() if was[0] != _CLEAR)
+        counts.append(len(here))
+        if here:
+            tile_row, tile_col = divmod(tile % (grid.tiles + 1), grid.tile_cols)
+            corner = tile_row * TILE_CELLS * grid.cols + tile_col * TILE_CELLS
+            for cell, kind, pace, stamp_ns in sorted(here):
+                changed.append((corner + cell // TILE_CELLS * grid.cols + cell % TILE_CELLS, kind, pace, stamp_ns))
+    columns: Iterable[Sequence[float]] = zip(*changed, strict=True) if changed else ((),) * len(_TYPES)
+    return NewWinners._make([*map(np.array, columns, _TYPES), counts])
+
+
+def _winners_of_few(sets: Sequence[MarkSet], now_ns: int) -> dict[int, tuple[int, float, int]]:
+    """Cell in the tile -> (kind, pace, stamp) of its winner."""
+    zones = [each for each in sets if is_zone(each.author)]
+    others = [each for each in sets if not is_zone(each.author)]
+    return _newest_of_few(others, now_ns) | _newest_of_few(zones, now_ns)
+
+
+def _newest_of_few(sets: Iterable[MarkSet], now_ns: int) -> dict[int, tuple[int, float, int]]:
+    won: dict[int, tuple[int, float, int]] = {}
+    for each in sets:
+        if not each.kinds:
+            continue
+        paces: Sequence[float] = memoryview(each.paces).cast("f").tolist()
+        if max(each.kinds) != _PACE:
+            paces = [0.0 if kind else pace for kind, pace in zip(each.kinds, paces, strict=True)]
+        stated = zip(each.kinds, paces, memoryview(each.stamps_ns).cast("q").tolist(), strict=True)
+        listed: Iterable[tuple[int, tuple[int, float, int]]]
+        listed = zip(memoryview(each.cells).cast("H").tolist(), stated, strict=True)
+        if each.untils_ns:
+            untils_ns = memoryview(each.untils_ns).cast("q").tolist()
+            listed = (one for one, until_ns in zip(listed, untils_ns, strict=True) if until_ns > now_ns)
+        if won:
+            for cell, one in listed:
+                held = won.get(cell)
+                if held is None or one[2] >= held[2]:  # on a tie the later set, of the larger author
+                    won[cell] = one
+        else:
+            won = dict(listed)
+    return won
+
+
+# --- many statements, as arrays ---------------------------------------------------------------------------------
 
 
 class _Placed(NamedTuple):
@@ -149,3 +211,8 @@ def _changed(before: _Placed, after: _Placed) -> _Placed:
 _CLEAR = int(MarkKind.CLEAR)
 _PACE = int(MarkKind.PACE)
 _AREA_BITS = TILE_AREA.bit_length() - 1
+_FEW = 128
+"""Up to this number of marks, before and after together, lists are faster than arrays."""
+_NOTHING = (_CLEAR, 0.0, NO_STATEMENT)
+_TYPES = (np.uint32, np.uint8, np.float32, np.int64)
+"""Types of the columns of `NewWinners`."""

@@ -50,30 +50,33 @@ class ZoneFacts:
     opened: int = 0
     file: FileFacts | None = None
 
+    @property
+    def title(self) -> str:
+        return f"{self.kind} zone" + (f" {self.name!r}" if self.name != self.kind else "")
+
     def sentence(self, cells: int) -> str:
         """A sentence; `cells` is how many the terrain has."""
-        shape = f"{self.kind} zone" + (f" {self.name!r}" if self.name != self.kind else "")
         text = f"{self.cells} cells, {self.changed} changed"
         if self.lethal:
             text += f", {self.lethal / cells:.1%} of the terrain made lethal"
         if self.opened:
             text += f", {self.opened} opened"
         if (file := self.file) is None:
-            return f"{shape}: {text}"
+            return f"{self.title}: {text}"
         layer = f" layer {file.layer!r}" if file.layer and file.layer != Path(file.file).stem else ""
         used = f"{file.used} of {file.features} {'features' if file.layer else 'values'}"
         bridges = f" ({file.bridges} bridge{'s' * (file.bridges > 1)})" if file.bridges else ""
-        parts = [f"{shape} from {file.file}{layer} in {file.crs}: {used}{bridges}", text]
+        parts = [f"{self.title} from {file.file}{layer} in {file.crs}: {used}{bridges}", text]
         left_out = [f"{file.outside} outside of the terrain"] if file.outside else []
         for why, count in file.skipped.most_common(6):
             names = file.named.get(why, [])
             left_out.append(f"{count} {why}" + (f" (feature {', '.join(names)})" if names else ""))
         if left_out:
             parts.append(f"left out: {', '.join(left_out)}")
-        if file.mended:
-            shown = ", ".join(file.mended[:5]) + (" ..." if len(file.mended) > 5 else "")
+        if file.repaired:
+            shown = ", ".join(file.repaired[:5]) + (" ..." if len(file.repaired) > 5 else "")
             parts.append(
-                f"{len(file.mended)} that cross themselves or are not closed were repaired: feature {shown}"
+                f"{len(file.repaired)} that cross themselves or are not closed were repaired: feature {shown}"
             )
         return "; ".join(parts)
 
@@ -82,7 +85,7 @@ class ZoneFacts:
         facts = {key: getattr(self, key) for key in ("name", "kind", "cells", "changed", "opened")}
         facts["lethal_share"] = round(self.lethal / cells, 6)
         if self.file is not None:
-            named = {"named": "skipped_ids", "mended": "mended_ids"}
+            named = {"named": "skipped_ids", "repaired": "repaired_ids"}
             facts |= {named.get(name, name): value for name, value in vars(self.file).items()}
         return facts
 
@@ -112,6 +115,16 @@ def paint_zones(
         for each in painted:
             step(each)
     return [each.facts for each in painted]
+
+
+def closing_zones(cost: CostConfig, grid: GridSpec, cell: int) -> list[str]:
+    """The zones which each make a cell lethal, for people."""
+    found = []
+    for zone in cost.zones:
+        pace = np.ones(grid.shape, np.float32)
+        facts = paint_zones(pace, [zone], grid, cost)
+        found += [facts[0].title] if np.isinf(pace.item(cell)) else []
+    return found
 
 
 Part = tuple[Window, NDArray[Any]]

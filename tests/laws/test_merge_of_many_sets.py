@@ -7,6 +7,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support import map_strategies as drawn
 
+from shared_map.replication import merge as merge_module
 from shared_map.replication.author_limits import Capacity
 from shared_map.replication.digest import fingerprint
 from shared_map.replication.marks import mark_set, packed, statements, unpacked
@@ -26,6 +27,12 @@ def ending_sets(draw: st.DrawFn) -> MarkSet:
     untils = draw(st.lists(st.sampled_from([1, 5, 9, FOREVER]), min_size=count, max_size=count))
     said = statements(made)._replace(untils_ns=np.array(untils, np.int64))
     return mark_set(made.author, made.group, made.tile, made.epoch, made.seq, said)
+
+
+@pytest.fixture(autouse=True, params=[-1, 10**9], ids=["many", "few"])
+def _both_ways(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The sets as arrays and as lists."""
+    monkeypatch.setattr(merge_module, "_FEW", request.param)
 
 
 def begun() -> tuple[MapReplica, drawn.Composite]:

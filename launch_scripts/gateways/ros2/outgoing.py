@@ -364,7 +364,7 @@ class Gateway:
             ("vehicles", Level.WARN if bad or not now.vehicles else Level.OK, vehicles,
              {"vehicles": len(now.vehicles), **dict(sorted(states.items()))}),
             ("targets", Level.WARN if lost else Level.OK,
-             f"nobody tracks {', '.join(lost[:10])}" if lost else f"{len(now.targets)} targets",
+             f"no tracker for {', '.join(lost[:10])}" if lost else f"{len(now.targets)} targets",
              {"targets": len(now.targets), "lost": len(lost), "captures": captures}),
             ("map", Level.OK if knows else Level.WARN, "ground and marks" if knows else nothing,
              {"crs": grid.crs, "origin_x_m": west_m, "origin_y_m": south_m, "rows": grid.rows, "cols": grid.cols,

@@ -158,7 +158,7 @@ class Placing:
             placed = [self._placed(shapes, of, shift, features) for shift in self._shifts]
         self._facts.features += len(features.numbers)
         self._facts.outside += len(features.numbers) - len(np.unique(of))
-        self._facts.mended += sorted({*mended, *map(features.id, features.closed.tolist())})
+        self._facts.repaired += sorted({*mended, *map(features.id, features.closed.tolist())})
         return np.concatenate([each for each, _ in placed]), np.concatenate([each for _, each in placed])
 
     def _placed(

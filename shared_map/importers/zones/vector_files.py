@@ -250,7 +250,7 @@ def _check_index(path: Path, source: str | bytes, what: str) -> int:
     inside = (at >= 100).all() and (length >= 4).all() and end <= ends.max(initial=100) <= len(shapes)
     heads = shapes[at[:, None] + np.arange(4, 8)] if inside else np.zeros((0, 4), np.uint8)
     if not np.array_equal(2 * heads.view(">i4")[:, 0], length):
-        raise TerrainError(f"{what} is damaged: its .shx is that of another file; make both anew")
+        raise TerrainError(f"{what} is damaged: its .shx is that of another file; make both again")
     return len(at)
 
 
@@ -432,7 +432,9 @@ def checked_xml(data: bytes, what: str) -> None:
                 raise TerrainError(f"{what} has a NetworkLink, which is not followed; save its areas in one file")
             id, tags = element.get("id"), _AREA_TAGS.get(name, ())
             if element.get("action") == "delete" or element.get("visible") == "false":
-                raise TerrainError(f"{what}: {name} {id} is deleted, but still in the file; download the area anew")
+                raise TerrainError(
+                    f"{what}: {name} {id} is deleted, but still in the file; download the area again"
+                )
             is_area = any([inner.get("k"), inner.get("v")] in tags for inner in element)
             if name in ("node", "way"):
                 known.add((name, id))

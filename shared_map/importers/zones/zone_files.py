@@ -40,7 +40,7 @@ class FileFacts:
     outside: int = 0
     skipped: Counter[str] = field(default_factory=Counter)
     named: dict[str, list[str]] = field(default_factory=dict)
-    mended: list[str] = field(default_factory=list)
+    repaired: list[str] = field(default_factory=list)
     bridges: int = 0
 
     def skip(self, why: str, id: str | None = None) -> None:

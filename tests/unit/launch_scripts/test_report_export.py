@@ -193,7 +193,7 @@ def test_polygons_of_marks_cover_the_cells_that_are_marked_and_no_others(tmp_pat
 
 def test_what_cannot_be_exported_is_said_in_a_sentence(run: Path, tmp_path: Path, swarm: Swarm) -> None:
     for words, complaint in (
-        ((run, "--out", run / TRACKS_FILE), "is a file; expected a folder"),
+        ((run, "--out", run / TRACKS_FILE), "expected a folder, or a file with an ending of geojson,"),
         ((run, "--out", tmp_path / "a.csv"), "found one file for"),
     ):
         code, _, told = swarm("runs", "export", *words)

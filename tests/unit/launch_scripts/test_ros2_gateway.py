@@ -244,7 +244,7 @@ def test_targets_that_no_one_tracks_are_not_told() -> None:
     (array,) = puts(actions, "targets")
     assert [(each.position.x, each.position.y) for each in array.poses] == [(10.0, 10.0)]
     (diagnostics,) = puts(actions, "diagnostics")
-    assert "nobody tracks t1" in [each.message for each in diagnostics.status]
+    assert "no tracker for t1" in [each.message for each in diagnostics.status]
 
 
 # --- the map ------------------------------------------------------------------------------------------------------

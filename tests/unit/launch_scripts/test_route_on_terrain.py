@@ -13,6 +13,7 @@ from types import SimpleNamespace
 from typing import Any
 from xml.etree import ElementTree
 
+import msgspec
 import numpy as np
 import pyogrio
 import pytest
@@ -128,6 +129,15 @@ def test_a_place_on_lethal_ground_is_refused_with_the_nearest_that_is_not(hill: 
         nearest = str(told.value).split("reached is ")[1].split()[0]
         ends = (nearest, end) if option == "--from" else (start, nearest)
         assert find_route(find_scenario(str(hill)), *ends).cost_s > 0
+
+
+def test_a_place_which_a_zone_closes_is_refused_with_the_zone(hill: Path) -> None:
+    scenario = find_scenario(str(hill))
+    zone = ZoneConfig(kind="forbidden", name="range", polygon_m=((0, 0), (200, 0), (200, 400), (0, 400)))
+    closed = msgspec.structs.replace(scenario, cost=msgspec.structs.replace(scenario.cost, zones=(zone,)))
+    with pytest.raises(SwarmError, match=r"--from .* no way leads there; closed by forbidden zone 'range'") as told:
+        find_route(closed, "cell:10,5", "cell:10,75")
+    assert "degrees" not in str(told.value)
 
 
 def test_the_time_from_everywhere_is_that_of_the_routes_as_raster_and_as_areas(

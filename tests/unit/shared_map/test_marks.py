@@ -8,6 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from support.map_strategies import GRID, Composite, mark_sets, merge_one, replica_of, retract, set_of
 
+from shared_map.replication import merge as merge_module
 from shared_map.replication.marks import (
     MAX_AHEAD_NS,
     NO_STATEMENT,
@@ -69,7 +70,9 @@ def test_a_stamp_beyond_time_is_no_mark() -> None:
         set_of("a", 0, 0, {0: (LETHAL, 0, STAMP_LIMIT_NS)})
 
 
-def test_of_two_statements_of_one_stamp_that_of_the_larger_author_wins_and_a_zone_over_both():
+@pytest.mark.parametrize("few", [-1, 10**9])
+def test_of_two_statements_of_one_stamp_that_of_the_larger_author_wins_and_a_zone_over_both(few, monkeypatch):
+    monkeypatch.setattr(merge_module, "_FEW", few)
     first, second = set_of("a", 0, 0, {5: (PACE, 2.0, 7)}), set_of("b", 0, 0, {5: (PACE, 3.0, 7)})
     zone = set_of(zone_author("z"), 0, 0, {5: (PACE, 4.0, 1)})
     for sets, pace in (([first, second], 3.0), ([zone, first, second], 4.0)):
@@ -85,13 +88,16 @@ def test_the_difference_that_a_set_makes_is_that_between_before_and_after(new, o
     since = sorted([*others, new], key=_author)
     before, after = dense(winners(held, 0)), dense(winners(since, 0))
     differs = np.flatnonzero((before.kinds != after.kinds) | (before.paces != after.paces))
-    changed = new_winners(GRID, [TileChange(0, held, since)], 0, 0)
-    assert changed.counts == [len(differs)]
-    order = np.argsort(changed.cells)
-    assert changed.cells[order].tolist() == grid_cells(GRID, tile_corners(GRID, 0), differs).tolist()
-    assert changed.kinds[order].tolist() == after.kinds[differs].tolist()
-    assert changed.paces[order].tolist() == after.paces[differs].tolist()
-    assert changed.stamps_ns[order].tolist() == after.stamps_ns[differs].tolist()
+    for few in (-1, 10**9):  # by arrays and by lists
+        with pytest.MonkeyPatch.context() as patch:
+            patch.setattr(merge_module, "_FEW", few)
+            changed = new_winners(GRID, [TileChange(0, held, since)], 0, 0)
+        assert changed.counts == [len(differs)]
+        order = np.argsort(changed.cells)
+        assert changed.cells[order].tolist() == grid_cells(GRID, tile_corners(GRID, 0), differs).tolist()
+        assert changed.kinds[order].tolist() == after.kinds[differs].tolist()
+        assert changed.paces[order].tolist() == after.paces[differs].tolist()
+        assert changed.stamps_ns[order].tolist() == after.stamps_ns[differs].tolist()
 
 
 def _author(of: MarkSet) -> str:

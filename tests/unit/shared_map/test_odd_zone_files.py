@@ -28,7 +28,7 @@ def test_odd_shapes_are_taken_as_what_they_enclose(tmp_path: Path) -> None:
     file = geojson(tmp_path / "a.geojson", [feature(star, id=7), feature(mixed), feature(three_d)])
     pace, (facts,) = painted([ZoneConfig(kind="forbidden", file=file)])
     assert np.isinf(pace[[20, 3, 30, 9, 7], [20, 3, 5, 3, 42]]).all()  # the middle of the star, too
-    assert facts.file.mended == ["7"]
+    assert facts.file.repaired == ["7"]
     assert facts.file.used == 3
 
 
