@@ -1,7 +1,5 @@
 """A machine without the terrain's file, played by a folder without it: it drives on what the keeper sends."""
 
-from __future__ import annotations
-
 import json
 import time
 from pathlib import Path

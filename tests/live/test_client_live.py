@@ -4,8 +4,6 @@ The scripts of the pages about vehicles and trackers of one's own run as they st
 another, and the rover ten times as quick, as time in this swarm is. Vehicles with right of way follow. The tests
 build on each other's order."""
 
-from __future__ import annotations
-
 import json
 import os
 import re

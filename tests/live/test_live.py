@@ -1,7 +1,5 @@
 """One small swarm of real processes, and all that may happen to it. The tests build on each other's order."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

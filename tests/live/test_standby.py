@@ -1,7 +1,5 @@
 """The machine of the leading planners dies or hangs, and the standbys on another one answer."""
 
-from __future__ import annotations
-
 import itertools
 import os
 import signal

@@ -1,7 +1,5 @@
 """A swarm of real processes on free ports of this machine: all at once (`LiveSwarm`) or one by one (`Hands`)."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import re

@@ -1,7 +1,5 @@
 """Hypothesis strategies of the planner: terrains, rules, and the changes of a tree."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import Any
 

@@ -1,7 +1,5 @@
 """Targets: where they start, how they move, when they are captured, and what the service tells of it."""
 
-from __future__ import annotations
-
 import itertools
 import math
 import random
