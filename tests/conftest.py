@@ -3,8 +3,6 @@ that replay seeded histories run others; `--thorough` adds those of which the ot
 Properties are tried with the same examples in every run, so that a gate answers the same twice; `--random` looks
 for new ones."""
 
-from __future__ import annotations
-
 import os
 import tempfile
 from pathlib import Path

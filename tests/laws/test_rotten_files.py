@@ -92,17 +92,13 @@ def save_generations(store: GenerationFile, number: int) -> None:
     store.save([*store.generations, number + 1])
 
 
-def generations_of(store: GenerationFile) -> Parts:
-    return (store.generations,)
-
-
 MARKS_IN_USE = Kind(KeeperStore, save_marks, marks_of, KeeperStore._unlock, (".lock", "-wal"))
 """The log is not put into the file."""
 KINDS = {
     "marks": Kind(KeeperStore, save_marks, marks_of, KeeperStore.close),
     "marks with their log": MARKS_IN_USE,
     "promises": Kind(FilePromiseStore, save_promises, promises_of, FilePromiseStore.close),
-    "lives": Kind(GenerationFile, save_generations, generations_of, GenerationFile.close),
+    "lives": Kind(GenerationFile, save_generations, lambda store: (store.generations,), GenerationFile.close),
 }
 
 

@@ -1,7 +1,5 @@
 """Fixtures which several live tests start."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 

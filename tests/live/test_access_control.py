@@ -4,8 +4,6 @@ A session with a router's certificate is the counterpart: it may do everything. 
 table, its own and those of others, and the successful attempts are compared with the table.
 """
 
-from __future__ import annotations
-
 import socket
 import ssl
 import time

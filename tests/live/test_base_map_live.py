@@ -1,7 +1,5 @@
 """A machine without the terrain's file, played by a folder without it: it drives on what the keeper sends."""
 
-from __future__ import annotations
-
 import json
 import time
 from pathlib import Path
@@ -72,42 +70,3 @@ def test_planner_and_agents_without_the_file_drive_on_the_keepers_base_map(hands
     assert told.returncode == 3
     assert "are the [cost] sections of the scenarios the same?" in told.stderr
     assert "Traceback" not in told.stderr
-
-
-@pytest.mark.thorough
-def test_several_keepers_by_name_agree_and_the_second_outlives_the_first(hands: Hands) -> None:
-    scenario = str(hands.path)
-    endpoint = hands.network.connect[0]
-    hands.start("role", "router", scenario)
-    eventually(lambda: swarm("status", "--connect", endpoint).returncode == 0, 30, "the router")
-    first = hands.start("role", "keeper", scenario, "--run-id", "two")
-    for role in (
-        ("targets",),
-        ("planner", "--target", "t0"),
-        ("planner", "--target", "t1"),
-        ("agent", "--id", "a0"),
-    ):
-        hands.start("role", role[0], scenario, "--run-id", "two", *role[1:])
-
-    def sets(store: str) -> dict[str, int]:
-        path = hands.folder / "runs" / "two" / store
-        told = swarm("marks", "show", path, "--json")
-        if told.returncode:
-            return {}
-        return {author: held["marks"] for author, held in json.loads(told.stdout)["authors"].items()}
-
-    eventually(lambda: sets("map.sqlite"), 90, "marks in the first keeper's store")
-    second = hands.start("role", "keeper", scenario, "--id", "east")
-    eventually(lambda: sets("map-east.sqlite"), 60, "marks in the second keeper's store")
-    first.kill()
-    first.wait(10)
-    before = sets("map.sqlite")
-    eventually(
-        lambda: all(sets("map-east.sqlite").get(author, 0) >= marks for author, marks in before.items()),
-        30,
-        "the second keeper to have what the first had",
-    )
-    assert second.poll() is None
-    told = swarm("role", "keeper", scenario, "--id", "no/name", "--runs", hands.folder / "runs")
-    assert told.returncode == 2
-    assert "--id 'no/name' is not 1 to 64 of letters" in told.stderr

@@ -1,8 +1,6 @@
 """Every role started by hand, as on several machines: a part of a swarm that joins the rest, and what a role tells
 probes, a supervisor and a collector of logs."""
 
-from __future__ import annotations
-
 import json
 import signal
 import socket

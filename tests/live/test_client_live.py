@@ -4,8 +4,6 @@ The scripts of the pages about vehicles and trackers of one's own run as they st
 another, and the rover ten times as quick, as time in this swarm is. Vehicles with right of way follow. The tests
 build on each other's order."""
 
-from __future__ import annotations
-
 import json
 import os
 import re
@@ -22,12 +20,8 @@ from support.live_swarm import SWARM, LiveSwarm
 from support.live_swarm import swarm as command
 from support.processes import eventually
 
-from swarm.bus.zenoh_bus import open_bus
 from swarm.client import BusError, ConfigError, Swarm, SwarmError, connect
 from swarm.clock import NS_PER_S
-from swarm.right_of_way.external_session import ExternalSession
-from swarm.right_of_way.generations import GenerationFile
-from swarm.runtime.run_secret import authenticator_of
 from swarm.runtime.tracker_ownership import SAME_NS
 
 pytestmark = [pytest.mark.network, pytest.mark.slow]
@@ -185,62 +179,7 @@ def test_a_vehicle_with_right_of_way_reserves_its_way_and_is_let_in_cell_by_cell
             other.may_enter(5)
 
 
-# --- vehicles that are not in the scenario: a program's own, and those that `swarm order vehicle add` drives ---
-
-
-def route_of(swarm: Swarm) -> list[int]:
-    """The first cells of a route to a target, from somewhere along the diagonal."""
-    for n in range(10, 90, 7):
-        route = swarm.route_soon("t0", *swarm.frame.centre_m(swarm.frame.grid.cell(n, n))).result(20.0)
-        if len(route.cells) > 12:
-            return list(route.cells[:12])
-    raise AssertionError("no route of twelve cells from anywhere")
-
-
-ROVER = """
-import sys, time
-from pathlib import Path
-from swarm.client import connect
-
-endpoint, file, *cells = sys.argv[1:]
-path = [int(cell) for cell in cells]
-with connect(endpoint) as swarm:
-    rover = swarm.vehicle("rover", right_of_way=Path(file))
-    for here, there in zip(path, path[1:]):
-        rover.at(*swarm.frame.centre_m(here))
-        rover.reserve(path[path.index(here) + 1:], timeout_s=20.0)
-        assert rover.may_enter(there), there
-    rover.at(*swarm.frame.centre_m(path[-1]))
-    print("there", flush=True)
-    time.sleep(60)
-"""
-
-
-def session_of(live: LiveSwarm, swarm: Swarm, name: str, folder: Path) -> ExternalSession:
-    bus = open_bus(live.network, authenticator=authenticator_of(live.network, live.run_dir.name))
-    return ExternalSession(name, swarm.frame.grid, bus, GenerationFile(folder / name))
-
-
-def test_ones_own_program_drives_dies_comes_back_and_leaves(live: LiveSwarm, swarm: Swarm, tmp_path: Path) -> None:
-    path = route_of(swarm)
-    program = Run(ROVER, live.endpoint, live.endpoint, tmp_path / "rover", *path[:6]).process
-    assert program.stdout.readline() == "there\n"
-    program.kill()
-    program.wait(10)
-    with session_of(live, swarm, "other", tmp_path) as other:
-        # The rover stands there, though its lease as an obstacle is over.
-        assert not other.enter(path[5], timeout_s=4.0)
-        with session_of(live, swarm, "rover", tmp_path) as rover:
-            assert rover.enter(path[5], timeout_s=10.0)
-            rover.want(path[5:])
-            for here, there in pairwise(path[5:]):
-                assert rover.may_enter(there, timeout_s=20.0), (rover.cells, there, rover.warnings)
-                rover.left(here)
-            assert other.may_enter(path[5], timeout_s=10.0)  # what it has asked for all the time
-        assert other.leave(timeout_s=10.0)
-        assert other.enter(path[-1], timeout_s=10.0)  # the rover has left
-    with session_of(live, swarm, "third", tmp_path) as third:
-        assert third.enter(path[-1], timeout_s=10.0)
+# --- vehicles that are not in the scenario, which `swarm order vehicle add` drives ---
 
 
 def vehicles_of(swarm: Swarm, agent: str, count: int) -> set[str]:

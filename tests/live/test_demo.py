@@ -1,7 +1,5 @@
 """The README's first command, without a screen, and what must hold of it."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import re

@@ -26,9 +26,10 @@ from bench.wire.partition import partitions
 from support import onlooker_program
 from support.live_swarm import SMALL_WORLD
 from support.machines import Machines, machines, why_not
+from support.onlooker_program import steady
 from support.processes import eventually
 
-from swarm.peers import job_of, split_rank
+from swarm.peers import split_rank
 
 pytestmark = [pytest.mark.network, pytest.mark.slow]
 
@@ -240,13 +241,6 @@ def lose_one(made: Deployed, onlooker: Onlooker) -> dict[str, float]:
         "until the last vehicle got a route": max(first_routes()) - lost_s,
         "without an answer to a client": max(silent_s),
     }
-
-
-def steady(leads: dict[str, float], planner: str) -> bool:
-    """True if a planner leads, and none of its standbys has led for a while."""
-    others = [at_s for id, at_s in leads.items() if id != planner and job_of(id) == planner]
-    now_s = time.monotonic()
-    return now_s - leads.get(planner, -math.inf) < 1.0 and now_s - max(others, default=-math.inf) > 3.0
 
 
 def lacking(acknowledged: dict[str, list[int]], path: Path) -> set[str]:

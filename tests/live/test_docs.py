@@ -5,8 +5,6 @@ or what it needs: `<!-- not run: two machines -->`, `<!-- beside: swarm demo -->
 all blocks of the page.
 """
 
-from __future__ import annotations
-
 import os
 import re
 import shlex

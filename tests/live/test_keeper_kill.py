@@ -1,8 +1,6 @@
 """kill -9 of a keeper process at random instants under load, over real zenoh: what its digests acknowledged is in
 its file. By hand, more often: `python tests/live/test_keeper_kill.py 200`."""
 
-from __future__ import annotations
-
 import json
 import multiprocessing
 import os

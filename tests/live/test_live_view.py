@@ -1,7 +1,5 @@
 """The view of a person: the live view in a real browser, and in rerun's own viewer."""
 
-from __future__ import annotations
-
 import contextlib
 import importlib.util
 import io

@@ -1,7 +1,5 @@
 """`gateway mavlink` between a swarm of real processes and an autopilot that is not ours: MAVSDK's server side."""
 
-from __future__ import annotations
-
 import os
 import re
 import signal

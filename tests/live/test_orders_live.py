@@ -1,8 +1,6 @@
 """Orders to real processes: each command returns when all obey, and an order outlives the processes that obey
 it."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

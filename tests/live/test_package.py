@@ -1,7 +1,5 @@
 """The package as a stranger installs it: a wheel, an environment for each extra, and its first command."""
 
-from __future__ import annotations
-
 import ast
 import os
 import re

@@ -1,7 +1,5 @@
 """Robots of a foreign ROS stack in a real swarm: vehicles, plans, goals, questions, orders; and when they die."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Iterator
 from pathlib import Path

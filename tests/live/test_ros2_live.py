@@ -1,7 +1,5 @@
 """`gateway ros2` beside a real swarm: heard by a foreign stack, by plain Zenoh, by a late node of ours."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 import time

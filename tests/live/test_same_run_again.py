@@ -1,7 +1,5 @@
 """A run outlives its processes: all may be started again, and the acknowledged state is there."""
 
-from __future__ import annotations
-
 import json
 import os
 import signal

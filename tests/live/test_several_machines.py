@@ -1,7 +1,5 @@
 """A run on two machines, as the page says: certificates, a launcher on each, a name that is revoked."""
 
-from __future__ import annotations
-
 import json
 import shutil
 import signal

@@ -1,7 +1,5 @@
 """A whole swarm on a disk that becomes full, and has space again."""
 
-from __future__ import annotations
-
 import os
 import shutil
 import signal

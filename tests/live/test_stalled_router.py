@@ -1,7 +1,5 @@
 """A router that stood still past its lease delivers under other keys: none of it is believed, each is counted."""
 
-from __future__ import annotations
-
 import os
 import signal
 import time

@@ -1,7 +1,5 @@
 """`swarm study run` on a cluster of this machine: nothing is lost by a worker or a sweep that is killed."""
 
-from __future__ import annotations
-
 import os
 import signal
 import subprocess

@@ -3,8 +3,6 @@
 The longest time of a vehicle without a route while three machines go from the version before to this one:
 `PYTHONPATH=.:tests python tests/live/test_two_versions.py`, and with `--stop-first` without taking over."""
 
-from __future__ import annotations
-
 import signal
 import subprocess
 import sys

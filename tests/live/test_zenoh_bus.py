@@ -1,7 +1,5 @@
 """Real sessions through a real router do what every bus does, and what only a real one can."""
 
-from __future__ import annotations
-
 import contextlib
 import gc
 import json

@@ -1,8 +1,6 @@
 """zenohd and its storage-manager plugin as router and store. Opt-in: `ZENOHD=/opt/zenohd pytest -m zenohd`, or
 zenohd on PATH with the plugin beside it; `docs/operate/routers.md` says how to install them."""
 
-from __future__ import annotations
-
 import time
 from collections.abc import Iterator
 from pathlib import Path

@@ -1,7 +1,5 @@
 """Agents on a simulated network, with their planners, and targets that stand where they are put."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from typing import Self

@@ -1,7 +1,5 @@
 """Rules of right of way, each taken out: functions which break one, and histories in which laws must notice it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

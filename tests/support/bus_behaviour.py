@@ -4,8 +4,6 @@
 For codes of messages the `bus` of a world takes an `authenticator`.
 """
 
-from __future__ import annotations
-
 from typing import Any
 
 import pytest

@@ -1,7 +1,5 @@
 """A network under test, and the terms in which the rules of a bus are written."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any, Protocol
 

@@ -1,7 +1,5 @@
 """A program of the client library on a simulated network: the session that a live one has, without its thread."""
 
-from __future__ import annotations
-
 from support.makers import run_info
 from support.swarm_model import SwarmModel
 

@@ -1,7 +1,5 @@
 """A browser held by its DevTools pipe: just enough to open a page and take its picture."""
 
-from __future__ import annotations
-
 import base64
 import json
 import os

@@ -1,7 +1,5 @@
 """Roles that do next to nothing, each in the way that a test of the launcher needs."""
 
-from __future__ import annotations
-
 import itertools
 import os
 import signal

@@ -1,8 +1,6 @@
 """The effort of each commit on a law: a share of the examples and histories that a test names. `--thorough` tries
 all of them."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterable, Sequence
 from typing import Any

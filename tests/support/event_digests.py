@@ -5,8 +5,6 @@
 A line for each run: world or scenario, seed, deliveries, digest of the log. Worlds run with faults, scenarios not.
 """
 
-from __future__ import annotations
-
 import hashlib
 import sys
 from typing import Any

@@ -1,7 +1,5 @@
 """The export of a swarm in which every figure has a value."""
 
-from __future__ import annotations
-
 from prometheus_client.openmetrics.exposition import generate_latest
 from prometheus_client.openmetrics.parser import text_string_to_metric_families
 from support.makers import planner_status, stats

@@ -1,7 +1,5 @@
 """The messages of a simulated run, as an observer receives them."""
 
-from __future__ import annotations
-
 import dataclasses
 from collections.abc import Iterator
 from pathlib import Path

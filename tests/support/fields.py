@@ -1,7 +1,5 @@
 """Fields of paces for laws and benchmarks: synthetic ones, files, and costs of any ratio."""
 
-from __future__ import annotations
-
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any

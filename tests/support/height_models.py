@@ -1,7 +1,5 @@
 """Height models as files, for tests of the readers."""
 
-from __future__ import annotations
-
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any

@@ -1,7 +1,5 @@
 """A launcher whose processes have the roles of `support.dummy_roles`."""
 
-from __future__ import annotations
-
 import time
 from functools import cache
 from pathlib import Path

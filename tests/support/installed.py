@@ -1,7 +1,5 @@
 """Environments as `pip install` makes them, without a network: packages are linked from the running environment."""
 
-from __future__ import annotations
-
 import marshal
 import sys
 import tomllib

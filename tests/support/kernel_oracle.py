@@ -1,7 +1,5 @@
 """Growth beside an independent Dijkstra, on any grid and every rule."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import numpy as np

@@ -1,7 +1,5 @@
 """A sender of well-formed lies on a memory bus."""
 
-from __future__ import annotations
-
 import random
 from collections import defaultdict, deque
 from collections.abc import Callable, Iterable, Iterator

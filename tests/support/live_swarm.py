@@ -1,7 +1,5 @@
 """A swarm of real processes on free ports of this machine: all at once (`LiveSwarm`) or one by one (`Hands`)."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import re
@@ -112,9 +110,6 @@ class LiveSwarm(Child):
         assert self.process.poll() is None, self.text
         return text in self.text
 
-    def wait_until_up(self) -> None:
-        eventually(lambda: self.said("all processes are alive"), 90, "the start of the swarm")
-
     def pid_of(self, name: str) -> int:
         """Process id of the newest incarnation, from its log."""
         log = (self.run_dir / f"{name}.log").read_text()
@@ -130,7 +125,7 @@ class LiveSwarm(Child):
 def running(folder: Path, *options: object, also: str = "", text: str = _SCENARIO) -> Iterator[LiveSwarm]:
     """A swarm all of whose processes are alive, and which is killed in the end."""
     with LiveSwarm(folder, *options, also=also, text=text) as live:
-        live.wait_until_up()
+        eventually(lambda: live.said("all processes are alive"), 90, "the start of the swarm")
         yield live
 
 

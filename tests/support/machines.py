@@ -1,7 +1,5 @@
 """Machines played by network namespaces on one bridge, each with an address of its own."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import shutil

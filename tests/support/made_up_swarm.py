@@ -1,7 +1,5 @@
 """Made-up vehicles, routes, marks and a target, for observers of a swarm from outside."""
 
-from __future__ import annotations
-
 import time
 from multiprocessing.connection import Connection
 from typing import Any

@@ -1,7 +1,5 @@
 """Other systems on a MAVLink link, by pymavlink itself. Tests that import this are left out without it."""
 
-from __future__ import annotations
-
 from typing import Any
 
 import pytest

@@ -6,8 +6,6 @@ Speaks to udp PORT of loopback. It has MAVSDK's protocols, its codec and its che
 straight from item to item. Each line that it prints is what it has heard, or `at LAT LON` once a second.
 """
 
-from __future__ import annotations
-
 import math
 import os
 import sys

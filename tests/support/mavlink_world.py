@@ -1,7 +1,5 @@
 """An adapter's core between a vehicle and a swarm that a test plays, on a clock that it moves."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, field
 
 from launch_scripts.gateways.mavlink import mavlink_codec as codec

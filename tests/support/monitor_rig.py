@@ -1,7 +1,5 @@
 """A monitor on a memory bus, and another sender."""
 
-from __future__ import annotations
-
 from collections.abc import Iterable
 from pathlib import Path
 

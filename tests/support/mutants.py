@@ -10,8 +10,6 @@ cosmic-ray's own runner wants a database and one command for all modules. Its op
 each mutant meet only the tests that can see it, which is what makes a sample of 200 affordable.
 """
 
-from __future__ import annotations
-
 import argparse
 import ast
 import compileall

@@ -1,7 +1,5 @@
 """The version before this one: `tests/live/neighbour_version.txt` names its commit, git has its tree."""
 
-from __future__ import annotations
-
 import io
 import os
 import re

@@ -1,5 +1,5 @@
 """An operator's program on a machine of its own: it notes routed vehicles, answering processes, and
-acknowledgements of keepers. Run by `Onlooker` of tests/live/test_deploy_plan.py.
+acknowledgements of keepers. Run by `Onlooker` of tests/live/test_deploy_plan.py; its `Notes` serve other tests.
 
 argv: the scenario, the router's endpoint, the folder of certificates, seconds after which it ends by itself. It
 prints a line of JSON ten times a second, and ends with its input, too.
@@ -8,9 +8,11 @@ prints a line of JSON ten times a second, and ends with its input, too.
 from __future__ import annotations
 
 import json
+import math
 import select
 import sys
 import time
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import msgspec
@@ -22,6 +24,7 @@ from swarm.bus.bus import Event, Heard, Replied
 from swarm.bus.zenoh_bus import ZenohBus, open_bus
 from swarm.config.scenario import TlsConfig
 from swarm.config.scenario_files import load_scenario
+from swarm.peers import job_of
 from swarm.runtime.inbox import Inbox
 from swarm.wire.messages.map_data import DIGEST_ROW, Digest, is_keeper
 from swarm.wire.messages.planning import PushedRoute, RouteReply, RouteRequest
@@ -83,24 +86,27 @@ class Notes:
                     lives[reply.incarnation] = (first_s if now_s - last_s < 1.0 else now_s), now_s
 
 
-def look_on(bus: ZenohBus, targets: list[str], seconds: float) -> None:
-    notes, inbox = Notes(), Inbox()
+def look_on(bus: ZenohBus, notes: Notes, targets: Sequence[str], goes_on: Callable[[], bool]) -> None:
+    """Asks for a route to each target every 50 ms, and notes what comes."""
+    inbox = Inbox()
     for topic in (FLEET, PUSHED_ROUTE, FOLLOWED, LEAD, DIGEST):
         bus.subscribe(topic, inbox.post)
-    ask_at_s = tell_at_s = time.monotonic()
-    until_s = ask_at_s + seconds
-    while (now_s := time.monotonic()) < until_s and not select.select([sys.stdin], [], [], 0)[0]:
-        if now_s >= ask_at_s:
-            ask_at_s = now_s + ASK_S
+    ask_at_s = time.monotonic()
+    while goes_on():
+        if time.monotonic() >= ask_at_s:
+            ask_at_s = time.monotonic() + ASK_S
             for target in targets:
                 bus.ask(ROUTE, RouteRequest(row=8, col=8), inbox.post, tag=target, timeout_s=1.0, target=target)
-        if now_s >= tell_at_s:
-            tell_at_s = now_s + TELL_S
-            sys.stdout.write(json.dumps(vars(notes)) + "\n")
-            sys.stdout.flush()
-        notes.take(inbox.take(max(min(ask_at_s, tell_at_s) - time.monotonic(), 0.0)))
+        notes.take(inbox.take(max(ask_at_s - time.monotonic(), 0.0)))
         while (event := inbox.take(0.0)) is not None:
             notes.take(event)
+
+
+def steady(leads: dict[str, float], planner: str) -> bool:
+    """True if a planner leads, by notes, and none of its standbys has led for a while."""
+    others = [at_s for id, at_s in [*leads.items()] if id != planner and job_of(id) == planner]
+    now_s = time.monotonic()
+    return now_s - leads.get(planner, -math.inf) < 1.0 and now_s - max(others, default=-math.inf) > 3.0
 
 
 def main(path: str, endpoint: str, certificates: str, seconds: str) -> None:
@@ -108,8 +114,19 @@ def main(path: str, endpoint: str, certificates: str, seconds: str) -> None:
     tls = TlsConfig(ca=str(Path(certificates) / "ca.pem"), certificate=certificates, key=certificates)
     network = msgspec.structs.replace(scenario.network, connect=(endpoint,), tls=tls)
     own = as_process(msgspec.structs.replace(scenario, network=network), LAUNCHER, "0")
+    notes, until_s = Notes(), time.monotonic() + float(seconds)
+    tell_at_s = 0.0
+
+    def tell() -> bool:
+        nonlocal tell_at_s
+        if time.monotonic() >= tell_at_s:
+            tell_at_s = time.monotonic() + TELL_S
+            sys.stdout.write(json.dumps(vars(notes)) + "\n")
+            sys.stdout.flush()
+        return time.monotonic() < until_s and not select.select([sys.stdin], [], [], 0)[0]
+
     with open_bus(own.network, patient=True) as bus:
-        look_on(bus, scenario.target_ids, float(seconds))
+        look_on(bus, notes, scenario.target_ids, tell)
 
 
 if __name__ == "__main__":

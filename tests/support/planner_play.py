@@ -1,7 +1,5 @@
 """A target's tree, its map, and the changes of both."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Iterator
 from typing import Any

@@ -1,7 +1,5 @@
 """Hypothesis strategies of the planner: terrains, rules, and the changes of a tree."""
 
-from __future__ import annotations
-
 from dataclasses import dataclass, replace
 from typing import Any
 
@@ -58,7 +56,7 @@ def inside(pace: NDArray[np.float32], window: Window) -> NDArray[np.float32]:
 
 def change(rng: np.random.Generator, patch: NDArray[np.float32], factor: float) -> None:
     """Multiplies paces by a factor; 0 draws them again, lethal ones too."""
-    patch[:] = patch * np.float32(factor) if factor else random_pace(rng, *patch.shape, 5.0, 0.3)
+    patch[:] = patch * np.float32(factor) if factor else random_pace(rng, len(patch), len(patch[0]), 5.0, 0.3)
 
 
 def random_climb(rng: np.random.Generator, grid: GridSpec, relief_m: float, steepest: float) -> Climb:

@@ -1,7 +1,5 @@
 """Planners on a simulated network: a tracker of targets, an agent that marks, and a client that asks and hears."""
 
-from __future__ import annotations
-
 from collections.abc import Callable
 from typing import Any
 

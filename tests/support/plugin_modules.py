@@ -1,7 +1,5 @@
 """Modules of plug-ins that tests write, and forget again."""
 
-from __future__ import annotations
-
 import importlib
 import sys
 from collections.abc import Iterator

@@ -1,7 +1,5 @@
 """Processes of this machine, by the session that a test started them in: names would match those of others, too."""
 
-from __future__ import annotations
-
 import contextlib
 import os
 import re

@@ -1,7 +1,5 @@
 """A planner on a map, without a bus or a worker, with a tree that does what the test says."""
 
-from __future__ import annotations
-
 import math
 from collections.abc import Callable, Sequence
 from typing import Any

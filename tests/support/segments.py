@@ -1,7 +1,5 @@
 """Straight segments between centres of cells, with crossings that are fractions: what they touch and cost."""
 
-from __future__ import annotations
-
 import itertools
 import math
 from fractions import Fraction

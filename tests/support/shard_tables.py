@@ -1,8 +1,6 @@
 """Messages of members, leaders and hosts of one shard in tests: shard 0 of a grid of 8 x 8 cells, and five
 agents."""
 
-from __future__ import annotations
-
 from collections.abc import Mapping, Sequence
 
 from swarm.clock import NS_PER_S

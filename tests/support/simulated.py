@@ -1,7 +1,5 @@
 """Helpers for tests of whole swarms: agents and vehicles, orders, agents that join, external vehicles."""
 
-from __future__ import annotations
-
 import random
 from collections import Counter
 from collections.abc import Sequence

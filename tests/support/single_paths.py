@@ -7,8 +7,6 @@ below the vehicle's new cell. Costs do not change here, so that no cell is ever 
 A state of MT-D* Lite is (g, rhs, parent, scratch for deleted cells, keys of the heap, its items).
 """
 
-from __future__ import annotations
-
 import numpy as np
 from numba import njit
 

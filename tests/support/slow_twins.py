@@ -1,7 +1,5 @@
 """Slow twins: the same answers as the kernels', from the definitions, with scipy or plain Python in float64."""
 
-from __future__ import annotations
-
 import heapq
 import math
 from collections.abc import Iterator

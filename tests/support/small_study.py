@@ -1,7 +1,5 @@
 """A study of short trials: a hill with ten vehicles, as a scenario in a file of its own."""
 
-from __future__ import annotations
-
 import os
 import signal
 from pathlib import Path

@@ -6,8 +6,6 @@
 `read` writes what it has found to standard output, a JSON object a line.
 """
 
-from __future__ import annotations
-
 import sys
 from pathlib import Path
 from typing import Any

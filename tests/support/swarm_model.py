@@ -1,7 +1,5 @@
 """A swarm of services on a memory network and a manual clock: a test says which roles it has, and moves time."""
 
-from __future__ import annotations
-
 import random
 from collections.abc import Callable, Sequence
 from typing import TypeVar

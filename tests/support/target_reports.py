@@ -1,7 +1,5 @@
 """Level ground, and the reports of vehicles and planners on it."""
 
-from __future__ import annotations
-
 import numpy as np
 from numpy.typing import NDArray
 from support.makers import fleet_of

@@ -4,8 +4,6 @@ A life is one tree over a small random map: its target steps and jumps, marks co
 adopted late, some routes are asked for in between. After each event every cell's route is checked.
 """
 
-from __future__ import annotations
-
 import math
 from collections.abc import Iterator
 from dataclasses import dataclass, field

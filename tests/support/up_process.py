@@ -1,7 +1,5 @@
 """`swarm up` as a process beside this one, for commands which measure or strike a swarm."""
 
-from __future__ import annotations
-
 import contextlib
 import json
 import os

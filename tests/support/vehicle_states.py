@@ -1,7 +1,5 @@
 """The table of transitions that `vehicle_agent.driving` gives, and a recorder of those that a vehicle makes."""
 
-from __future__ import annotations
-
 import functools
 import re
 from collections.abc import Callable

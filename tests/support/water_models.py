@@ -1,7 +1,5 @@
 """Height models of which it is known where water is, levelled and rounded as surveys do it."""
 
-from __future__ import annotations
-
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 

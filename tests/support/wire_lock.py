@@ -4,8 +4,6 @@ versions unnoticed (docs/design/wire-format.md).
     PYTHONPATH=.:tests python -m support.wire_lock       writes it, unless a change breaks a rule
 """
 
-from __future__ import annotations
-
 import enum
 import json
 import sys

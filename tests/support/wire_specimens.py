@@ -8,8 +8,6 @@ that the build knows of the type and the message as it writes it again, or with 
 `unknown` where it has no such type.
 """
 
-from __future__ import annotations
-
 import sys
 
 from support.wire_strategies import EXAMPLES, MESSAGES

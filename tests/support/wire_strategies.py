@@ -1,7 +1,5 @@
 """A strategy for every message of the wire, from the one generator of messages, and one example of each."""
 
-from __future__ import annotations
-
 import math
 from functools import partial
 

@@ -1,7 +1,5 @@
 """A router in a process of its own, for sessions of a test."""
 
-from __future__ import annotations
-
 import subprocess
 import sys
 

@@ -1,7 +1,5 @@
 """zenohd as a process of a test, where it is installed: in the folder that ZENOHD names, or on PATH."""
 
-from __future__ import annotations
-
 import json
 import os
 import shutil

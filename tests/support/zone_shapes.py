@@ -1,7 +1,5 @@
 """Files of shapes for tests of zones: written in any system, painted on a small grid."""
 
-from __future__ import annotations
-
 import json
 from pathlib import Path
 from typing import Any

@@ -24,7 +24,7 @@ from launch_scripts.launcher.run_options import UpOptions, chosen_processes
 from launch_scripts.launcher.takeover import TakeOver, writing
 from launch_scripts.launcher.watcher import LauncherHealth
 from launch_scripts.observe.latest_messages import LatestState, RunPlan
-from launch_scripts.process_table import ROLES, STOP_ORDER, ProcessSpec, processes_of
+from launch_scripts.process_table import ProcessSpec, processes_of
 from swarm.config.scenario import Scenario, StandbyConfig, TargetConfig
 from swarm.config.scenario_files import parse_scenario
 from swarm.errors import BusError, ConfigError
@@ -408,11 +408,6 @@ def test_processes_are_chosen_by_role_and_id_and_start_in_order() -> None:
 def test_the_referee_watches_also_where_someone_else_tracks_all_targets() -> None:
     scenario = Scenario(targets=(TargetConfig(walk="external"),))
     assert "targets-0" in [spec.name for spec in processes_of(scenario)]
-
-
-def test_the_router_starts_first_and_ends_last() -> None:
-    assert ROLES[0] == STOP_ORDER[-1] == "router"
-    assert sorted(ROLES) == sorted(STOP_ORDER)
 
 
 def test_the_wait_before_a_restart_doubles_to_five_seconds_and_is_short_again_after_a_good_run() -> None:

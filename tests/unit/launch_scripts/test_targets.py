@@ -1,7 +1,5 @@
 """Targets: where they start, how they move, when they are captured, and what the service tells of it."""
 
-from __future__ import annotations
-
 import itertools
 import math
 import random
@@ -21,7 +19,6 @@ from support.planner_swarm import Ear, rough
 from support.swarm_model import SwarmModel
 from support.target_reports import RES, flat, fleet
 
-from launch_scripts.process_table import processes_of
 from launch_scripts.simulation.world.rovers import Rovers
 from launch_scripts.simulation.world.service import PoseThrottle, TargetsService
 from launch_scripts.simulation.world.targets import (
@@ -50,7 +47,6 @@ from swarm.clock import NS_PER_S
 from swarm.config.ground import CostConfig
 from swarm.config.scenario import Scenario, TargetConfig, VehicleConfig, Walk
 from swarm.config.scenario_files import parse_scenario
-from swarm.errors import TerrainError
 from swarm.grid import GridSpec
 from swarm.wire.codec import decode, encode
 from swarm.wire.messages.planning import TargetPose
@@ -399,11 +395,6 @@ def test_no_one_squeezes_past_the_corner_of_a_lethal_cell() -> None:
     assert len(terrain(pace).home) == 1
 
 
-def test_a_terrain_without_a_passable_cell_is_refused() -> None:
-    with pytest.raises(TerrainError, match="every cell of the terrain is lethal"):
-        terrain(np.full((3, 3), np.inf, np.float32))
-
-
 @settings(deadline=None, max_examples=25)
 @given(st.integers(0, 10_000), st.sampled_from(MOVING))
 def test_every_step_of_every_walk_is_legal(seed: int, walk: Walk) -> None:
@@ -558,8 +549,3 @@ def test_rovers_stand_while_the_run_is_paused() -> None:
     assert {(obstacle.x_m, obstacle.y_m, obstacle.speed_m_per_s) for obstacle in ticks[-1].values()} == {
         (obstacle.x_m, obstacle.y_m, 0.0) for obstacle in ticks[0].values()
     }
-
-
-def test_rovers_need_the_process_that_moves_them() -> None:
-    external = parse_scenario(TEXT + '[[targets]]\nwalk = "external"\n')
-    assert any(spec.role == "targets" for spec in processes_of(external))

@@ -34,11 +34,6 @@ def replica_of(author: str | None, ground: Terrain) -> tuple[MapReplica, CostMap
     return MapReplica(GROUND.grid, cost_map, author=author), cost_map
 
 
-def let_settle(replica: MapReplica) -> None:
-    """Words that came too soon after a change have been taken in, too."""
-    replica.tick(replica.now_ns + 6 * NS_PER_S)
-
-
 def sets_of(author: str, *said: dict[int, Measurement]) -> list[MarkSet]:
     """The sets that an author publishes when it learns these, one after the other."""
     replica, _ = replica_of(author, GROUND)
@@ -85,7 +80,7 @@ def test_however_often_an_author_changes_its_mind_the_map_changes_once_in_five_s
         replica.tick(at_ns)
         replica.merge([each])
     assert cost_map.version <= 1 + len(sets) * every_ns // (5 * NS_PER_S) + 1
-    let_settle(replica)
+    replica.tick(at_ns + 6 * NS_PER_S)  # what came too soon after a change is taken in, too
     assert (cost_map.factors == factors_of([words[-1]])).all()
 
 

@@ -155,25 +155,6 @@ def cut(folder: Path, bands: np.ndarray, **profile: Any) -> dict[str, Any]:
     return made
 
 
-def promise_of_20_gb(folder: Path) -> dict[str, Any]:
-    path = folder / "a.tif"
-    size = {"count": 1, "height": 100_000, "width": 100_000, "dtype": "int16"}
-    with rasterio.open(path, "w", driver="GTiff", crs="EPSG:32632", transform=UTM, SPARSE_OK=True, **size):
-        pass
-    return {"source": path}
-
-
-def promise_in_16384(folder: Path) -> dict[str, Any]:
-    path = write(folder / "a.tif", heights(64, 64))
-    data = bytearray(path.read_bytes())
-    for tag in (256, 257):  # ImageWidth and ImageLength become 12800: 160 M cells in a file of 16 kB
-        at = data.find(np.array([tag, 3], "<u2").tobytes() + np.array([1], "<u4").tobytes())
-        assert int(data[at + 8]) == 64
-        data[at + 8 : at + 10] = np.array([12800], "<u2").tobytes()
-    path.write_bytes(bytes(data))
-    return {"source": path}
-
-
 def vrt(folder: Path, source: str, times: int = 1, name: str = "a.vrt") -> dict[str, Any]:
     """A raster which another file paints, several times over."""
     painted = f'<SimpleSource><SourceFilename relativeToVRT="1">{source}</SourceFilename></SimpleSource>' * times
@@ -255,8 +236,6 @@ BAD: list[tuple[Callable[[Path], dict[str, Any]], str]] = [
     (lambda f: with_photo(f, PHOTO, Affine.identity(), None), "georeference both, or make them the same size"),
     (lambda f: cut(f, heights(400, 400)), "truncated or no raster"),
     (lambda f: cut(f, NOISE, compress="deflate", tiled=True, blockxsize=128, blockysize=128), "truncated"),
-    (promise_of_20_gb, "has 100000 x 100000 pixels; at most 4294967296 are read"),
-    (promise_in_16384, "truncated"),
     (lambda f: text(f, "a.tif"), "no raster"),
     (lambda f: text(f, "a.qqq"), "is no raster that is read: it begins with b'this is .*gdal_translate FILE out"),
     (lambda f: {"source": f / "nowhere.tif"}, r"cannot read terrain .*nowhere\.tif: No such file"),

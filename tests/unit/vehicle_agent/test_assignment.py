@@ -319,16 +319,6 @@ class Two:
 NEAR_T0 = {"a0": [[10.0, 12.0], [100.0, 90.0]], "a1": [[14.0, 16.0], [60.0, 95.0]]}
 
 
-def test_two_agents_share_out_the_targets_between_all_of_their_vehicles() -> None:
-    """a1's first vehicle is the nearest to t1, so no vehicle of a0 has to go there."""
-    two = Two(NEAR_T0)
-    for n in range(3):
-        two.reassign("a0", 2 * n * PERIOD_NS)
-        two.reassign("a1", (2 * n + 1) * PERIOD_NS)
-    assert two.chased("a0") == ["t0", "t0"]
-    assert two.chased("a1") == ["t1", "t1"]
-
-
 def test_a_dead_agent_is_reckoned_with_for_three_periods_at_most() -> None:
     two = Two(NEAR_T0)
     two.reassign("a1", 0)
