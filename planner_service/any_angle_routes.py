@@ -78,23 +78,18 @@ class Puller:
         while True:
             pull_routes(*ground, (*given, stays), scratch, (*out, legs, turned), prices)
             done = int(out[1][-1]) if many else 0
-            returns = self._returns(starts, out[0][:done], out[1]) & ~stays
+            returns = self._returns(out[0][:done], out[1]) & ~stays
             if not returns.any():
                 return Pulled(out[0][:done], out[1], legs[: turned[0]]), prices * self._metres
             stays |= returns
 
-    def _returns(
-        self, starts: NDArray[np.int64], directions: NDArray[np.uint8], ends: NDArray[np.int64]
-    ) -> NDArray[np.bool_]:
+    def _returns(self, directions: NDArray[np.uint8], ends: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Returns bool (n,): the routes that come to a cell twice."""
-        route = np.repeat(np.arange(starts.size), np.diff(ends, prepend=0))
-        moved = np.cumsum(self._offsets[directions])
-        before = np.concatenate((np.zeros(1, np.int64), moved))[np.concatenate((np.zeros(1, np.int64), ends[:-1]))]
-        cells = np.concatenate((starts, starts[route] + moved - before[route]))
-        order = np.lexsort((cells, route := np.concatenate((np.arange(starts.size), route))))
-        cells, route = cells[order], route[order]
-        found = np.zeros(starts.size, np.bool_)
-        found[route[1:][(cells[1:] == cells[:-1]) & (route[1:] == route[:-1])]] = True
+        found, begin = np.zeros(ends.size, np.bool_), 0
+        for n, end in enumerate(ends.tolist()):
+            away = np.cumsum(self._offsets[directions[begin:end]])  # from the start, as a difference of cells
+            found[n] = np.unique(away).size < away.size or not away.all()
+            begin = end
         return found
 
     def pull_batch(self, routes: RouteBatch) -> RouteBatch:

@@ -46,7 +46,6 @@ class Follower:
     route      its last route from this incarnation of the planner; None if there is none
     bounds     row0, col0, row1, col1 of that route with its neighbour cells
     walked     the cells of that route; None until they are needed
-    row        in the table of all bounds
     stale      there may be a better route than the one it has
     push_ns    earliest time of its next push
     goal       the cell of the place to which it goes; None if it follows the target
@@ -59,7 +58,6 @@ class Follower:
     route: Route | None = None
     bounds: tuple[int, int, int, int] = _NOWHERE_BOUNDS
     walked: list[int] | None = None
-    row: int = -1
     stale: bool = False
     push_ns: int = 0
 
@@ -109,9 +107,6 @@ class Followers:
         self._lease_ns = lease_ns
         self._max_cells = max_cells
         self._by_id: dict[str, Follower] = {}
-        self._rows: tuple[list[Follower], NDArray[np.int64]] | None = None
-        """All followers and their bounds, int64 (n, 4): a route changes every few seconds, and whose route a change
-        concerns is asked in every tick. None once a follower has joined or left."""
         self._told: dict[str, _Told] = {}
         """Agent's name as an author -> its newest message, for the lease."""
 
@@ -137,7 +132,7 @@ class Followers:
         told = _Told(frozenset(chasers.ids), chasers.stamp_ns, now_ns)
         if before is not None:
             for id in before.ids - told.ids:
-                self._drop(id)
+                self._by_id.pop(id, None)
         elif len(self._told) >= CAPACITY:
             del self._told[next(iter(self._told))]
         self._told[chasers.author] = told
@@ -147,7 +142,7 @@ class Followers:
         for id, cell, goal in zip(chasers.ids, column(chasers.cells, "<u4").tolist(), goals, strict=True):
             follower = self._by_id.get(id)
             if cell >= self._grid.cells:
-                self._drop(id)
+                self._by_id.pop(id, None)
             elif follower is None:
                 self._register(id, Follower(cell, self._max_cells, now_ns, goal))
             else:
@@ -170,13 +165,8 @@ class Followers:
 
     def sent(self, follower: Follower, route: Route, push_ns: int) -> None:
         follower.route, follower.stale, follower.push_ns = route, False, push_ns
-        self._lies(follower, self._bounds(route) if route.status is RouteStatus.OK else _NOWHERE_BOUNDS)
-
-    def _lies(self, follower: Follower, bounds: tuple[int, int, int, int]) -> None:
-        """Notes where another route of a follower lies."""
-        follower.bounds, follower.walked = bounds, None
-        if self._rows is not None:
-            self._rows[1][follower.row] = bounds
+        follower.bounds = self._bounds(route) if route.status is RouteStatus.OK else _NOWHERE_BOUNDS
+        follower.walked = None
 
     def _bounds(self, route: Route) -> tuple[int, int, int, int]:
         """Outer bounds of a route, from its step counts: ten times as fast as walking it, and routes which turn
@@ -193,22 +183,17 @@ class Followers:
 
     def _forget_route(self, follower: Follower) -> None:
         follower.route, follower.stale, follower.push_ns = None, True, 0
-        self._lies(follower, _NOWHERE_BOUNDS)
+        follower.bounds, follower.walked = _NOWHERE_BOUNDS, None
 
     def _register(self, vehicle: str, follower: Follower) -> Follower:
         if len(self._by_id) >= CAPACITY:
             del self._by_id[next(iter(self._by_id))]
         self._by_id[vehicle] = follower
-        self._rows = None
         return follower
-
-    def _drop(self, vehicle: str) -> None:
-        if self._by_id.pop(vehicle, None) is not None:
-            self._rows = None
 
     def drop_silent(self, now_ns: int) -> None:
         for id in [id for id, each in self._by_id.items() if now_ns - each.heard_ns > self._lease_ns]:
-            self._drop(id)
+            del self._by_id[id]
         for author in [author for author, each in self._told.items() if now_ns - each.heard_ns > self._lease_ns]:
             del self._told[author]
 
@@ -293,13 +278,8 @@ class Followers:
         """Returns pairs of followers and windows that the bounds of the route meet."""
         if not windows or not self._by_id:
             return
-        if self._rows is None:
-            followers = list(self._by_id.values())
-            for row, follower in enumerate(followers):
-                follower.row = row
-            self._rows = followers, np.array([each.bounds for each in followers], np.int64)
-        followers, bounds = self._rows
-        row0, col0, row1, col1 = bounds.T[:, :, None]
+        followers = list(self._by_id.values())
+        row0, col0, row1, col1 = np.array([each.bounds for each in followers], np.int64).T[:, :, None]
         each = np.array([(w.row0, w.col0, w.row1, w.col1) for w in windows], np.int64).T
         near = (row0 < each[2]) & (each[0] < row1) & (col0 < each[3]) & (each[1] < col1)
         for n, m in zip(*map(np.ndarray.tolist, near.nonzero()), strict=True):

@@ -15,9 +15,8 @@ from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from planner_service.kernels.layout import step_offsets
+from planner_service.kernels.layout import NONE, step_offsets
 from planner_service.tree.cost_changes import NO_CHANGES, Cells, Changes, joined
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.partial_growth import CutTree, PartialGrowth, Way, way_of, whole_tree
@@ -85,8 +84,7 @@ class GoalTrees:
         self._budget = budget_bytes
         self._growth = PartialGrowth(costs)
         self._offsets = step_offsets(costs.stride).astype(np.int64)
-        self._room: NDArray[np.uint8] = np.empty(costs.size, np.uint8)
-        """Room for the longest route, of which only what routes need becomes memory."""
+        self._pointed = np.full(costs.size, NONE, np.uint8), np.empty(costs.size, np.uint32)
         self._in_hand: _Kept | None = None
         # By goal, in the order of their last asks.
         self._kept: OrderedDict[int, _Kept] = OrderedDict()
@@ -189,14 +187,14 @@ class GoalTrees:
     def _found(self, tree: CutTree, start: int, most: int) -> _Found:
         """The answer of a tree of the present map."""
         has_way = tree.at(start, self.costs.stride) < math.inf
-        return tree, way_of(self.costs, tree, start, most, self._room) if has_way else None
+        return tree, way_of(self.costs, tree, start, most, self._pointed) if has_way else None
 
     @property
     def _held(self) -> CutTree:
         """The tree that is being grown, as a view of it."""
-        growth, stride = self._growth, self.costs.stride
-        whole = growth.cost.reshape(-1, stride)
-        return CutTree(growth.root, (0, 0, *whole.shape), whole, growth.bound, 0.0)
+        growth, costs = self._growth, self.costs
+        whole = growth.cost.reshape(-1, costs.stride)
+        return CutTree(growth.root, costs.padded_box, whole, growth.bound, 0.0)
 
     def _as_it_was(self, changes: Changes, tree: CutTree, start: int, most: int) -> Way:
         """A route on the map on which the tree was grown."""
@@ -204,7 +202,7 @@ class GoalTrees:
         now = costs[cells]
         costs[cells[::-1]] = changes.before[::-1]  # of a cell that changed twice, its first cost stays
         try:
-            return way_of(self.costs, tree, start, most, self._room)
+            return way_of(self.costs, tree, start, most, self._pointed)
         finally:
             costs[cells] = now
 

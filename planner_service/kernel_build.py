@@ -28,13 +28,11 @@ from planner_service.kernels import (
     cell_costs,
     costs_from_parents,
     heap_and_buckets,
-    lower_bounds,
     parents_from_costs,
     partial_growth_kernels,
     piece_totals,
     queue_dial,
-    queue_directed,
-    queue_wide_buckets,
+    queue_levels,
     repair,
     route_kernels,
     stride_networks,
@@ -52,21 +50,17 @@ Kernel = Any
 
 FIRST: tuple[Kernel | StepKernel, ...] = (
     route_kernels.walk_routes,
-    StepKernel(queue_dial.grow_by_buckets, queue_directed.grow_directed_by_buckets),
+    StepKernel(queue_dial.grow_by_buckets, None),
+    queue_levels.grow_by_levels,
     parents_from_costs.point_to_parents,
-    StepKernel(queue_wide_buckets.grow_by_wide_buckets, None),
     parents_from_costs.untie_parents,
-    StepKernel(partial_growth_kernels.box_of, None),
     StepKernel(route_kernels.point_routes, None),
     StepKernel(partial_growth_kernels.find_aim, None),
     StepKernel(queue_dial.begin, None),
     partial_growth_kernels.open_cells,
-    cell_costs.pad_cell_costs,
-    cell_costs.changed_cells,
     route_kernels.drive_rests,
-    lower_bounds.bound_costs,
+    cell_costs.changed_cells,
     cell_costs.block_ranges,
-    cell_costs.count_classes,
 )
 """Kernels for full searches, for updates to the map by full searches, and for certified routes. The slowest to
 compile comes first, so that builders end together."""
@@ -80,7 +74,6 @@ LATER: tuple[Kernel | StepKernel, ...] = (
     cell_costs.find_rim,
     stride_networks.cut_blocks,
     stride_networks.find_ways_to_centres,
-    stride_networks.join_nodes,
     stride_networks.tighten,
     stride_networks.write_paths,
     tile_search.improve_tiles,
@@ -94,7 +87,7 @@ LATER: tuple[Kernel | StepKernel, ...] = (
 )
 """For windows, repairs, strides and pieces, which save growing whole trees."""
 
-GOALS = route_kernels.walk_by_costs, queue_dial.resume, partial_growth_kernels.stays_exact
+GOALS = (partial_growth_kernels.stays_exact,)
 """Beside those of `FIRST`, for `GoalTrees`."""
 
 PULL = any_angle_kernels.pull_routes

@@ -315,7 +315,7 @@ class TargetTree:
     def may_reach(self, cells: Any, costs_s: Floats) -> bool:
         """Returns True if a growth that has stopped may still find a way for one of the cells without a cost."""
         unknown = _in_a_row(cells)[np.isinf(costs_s)]
-        return not self._is_whole and self._look(unknown)[0].size > 0
+        return not self._is_whole and self._open(unknown).size > 0
 
     # --- how ----------------------------------------------------------------------------------------------------
 
@@ -531,7 +531,7 @@ class TargetTree:
         if not self.ready or self._is_whole:
             return self.ready
         self._reach(cells)
-        return self._is_whole or not self._without_path(self._look(cells)[0]).size
+        return self._is_whole or not self._without_path(self._open(cells)).size
 
     def _reach(self, cells: Any) -> None:
         """Continues a stopped growth up to these cells."""
@@ -576,6 +576,10 @@ class TargetTree:
         """Those of some padded cells from which the tree leads nowhere, or not yet."""
         return starts[~self._leads(starts)]
 
+    def _open(self, cells: Any) -> NDArray[np.int64]:
+        """Those of some numbers that are passable cells of the grid, padded."""
+        return self._look(cells)[0]
+
     def _look(self, cells: Any) -> tuple[NDArray[np.int64], int, int]:
         """Returns those of some numbers that are passable cells of the grid, padded; how many of them a growth that
         has stopped did not reach; and how many rows or columns the farthest is away from the root."""
@@ -591,7 +595,7 @@ class TargetTree:
         if not (isinstance(tree, CostToGoTree) and self._can_stop and tree.precise and self._all_kernels()):
             return None
         growth.begin(self.cost_grid.pad(tree.root))
-        starts = self._look(wanted)[0]
+        starts = self._open(wanted)
         grown = growth.go_on(starts, self.times.most_cells)
         if grown < 0 or (growth.bound < np.inf and not (growth.cost[starts] < np.inf).all()):
             return None

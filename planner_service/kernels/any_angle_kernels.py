@@ -41,6 +41,8 @@ NO_CORNERS, OPEN_CORNERS, ALL_CORNERS = range(3)
 """Through an exact corner a segment passes never, between two passable cells only, or always."""
 
 
+_STEPS = 7, 0, 1, 6, 255, 2, 5, 4, 3
+"""Directions of the steps by -1, 0 and 1 rows, of each those by -1, 0 and 1 columns."""
 _FLIGHT = "Tuple((f4[::1], f4[::1], f4[::1], UniTuple(f8, 2)))"
 
 
@@ -69,31 +71,35 @@ def _climb(flight, pace, before, cell, both):
 
 
 @helper
-def segment_cost(pace, flight, cols, corners, start, end, limit):
-    """float64: a segment's cost, in paces times cells; inf if it is not below `limit`, or meets a lethal cell, or
-    an exact corner that it may not pass."""
+def _drive(pace, flight, cols, corners, start, end, limit, directions, at):
+    """(float64: a segment's cost, in paces times cells; the index behind its steps).
+
+    limit       the cost is inf if it is not below this, or the segment meets a lethal cell, or an exact corner that
+                it may not pass
+    directions  the steps along the cells that it crosses are written there, from index `at` on; None if not needed
+    """
     down, right = end // cols - start // cols, end % cols - start % cols
     rows_left, cols_left = abs(down), abs(right)
     length = math.sqrt(np.float64(rows_left * rows_left + cols_left * cols_left))
     if length == 0.0:
-        return 0.0
+        return 0.0, at
     length = _flown(flight, np.float64(down), np.float64(right), length)
     row_step, col_step = cols if down > 0 else -cols, 1 if right > 0 else -1
     # The k-th line between rows is met at (2k + 1) / (2 * rows) of the way: odd numbers over `whole`, as integers.
     whole = 2 * max(rows_left, 1) * max(cols_left, 1)
     next_row = max(cols_left, 1) if rows_left else whole
     next_col = max(rows_left, 1) if cols_left else whole
-    cell, at, total = start, 0, 0.0
+    cell, met, total = start, 0, 0.0
     limit *= whole / length
     while next_row < whole or next_col < whole:
         crossing = min(next_row, next_col)
-        total += np.float64(pace[np.uint64(cell)]) * (crossing - at)
+        total += np.float64(pace[np.uint64(cell)]) * (crossing - met)
         if not total < limit:
-            return np.inf
+            return np.inf, at
         if next_row == next_col and corners != ALL_CORNERS:
             beside = max(pace[np.uint64(cell + row_step)], pace[np.uint64(cell + col_step)])
             if beside == np.inf or corners == NO_CORNERS:
-                return np.inf
+                return np.inf, at
         on_row, on_col = next_row == crossing, next_col == crossing
         before = cell
         if on_row:
@@ -102,10 +108,19 @@ def segment_cost(pace, flight, cols, corners, start, end, limit):
         if on_col:
             cell += col_step
             next_col += 2 * max(rows_left, 1)
+        if directions is not None:
+            directions[at] = _STEPS[(1 + on_row * (1 if down > 0 else -1)) * 3 + 1 + on_col * col_step]
+            at += 1
         total += _climb(flight, pace, before, cell, on_row and on_col) * (whole / length)
-        at = crossing
-    total += np.float64(pace[np.uint64(cell)]) * (whole - at)
-    return total * (length / whole) if total < limit else np.inf
+        met = crossing
+    total += np.float64(pace[np.uint64(cell)]) * (whole - met)
+    return total * (length / whole) if total < limit else np.inf, at
+
+
+@helper
+def _cost(pace, flight, cols, corners, start, end, limit):
+    """float64: a segment's cost, as of `_drive`."""
+    return _drive(pace, flight, cols, corners, start, end, limit, None, 0)[0]
 
 
 @helper
@@ -118,18 +133,18 @@ def _pull(pace, flight, cols, corners, scratch, size):
     along[0] = pulled[0] = 0.0
     before[0] = 0
     for j in range(1, size):
-        step = segment_cost(pace, flight, cols, corners, cells[j - 1], cells[j], np.inf)
+        step = _cost(pace, flight, cols, corners, cells[j - 1], cells[j], np.inf)
         along[j] = along[j - 1] + step
         best, turn = pulled[j - 1] + step, j - 1
         for back in LOOK_BACK:
             i = j - back
             if i >= 0:
-                cost = pulled[i] + segment_cost(pace, flight, cols, corners, cells[i], cells[j], best - pulled[i])
+                cost = pulled[i] + _cost(pace, flight, cols, corners, cells[i], cells[j], best - pulled[i])
                 if cost < best:
                     best, turn = cost, i
         i = before[j - 1]  # straight ways of any length: where the way to the cell before turned, and before that
         while True:
-            cost = pulled[i] + segment_cost(pace, flight, cols, corners, cells[i], cells[j], best - pulled[i])
+            cost = pulled[i] + _cost(pace, flight, cols, corners, cells[i], cells[j], best - pulled[i])
             if cost < best:
                 best, turn = cost, i
             elif turn != i:
@@ -156,34 +171,6 @@ def _goes_straight(cols, a, b, c):
     further_down, further_right = c // cols - b // cols, c % cols - b % cols
     same_line = down * further_right == right * further_down
     return same_line and down * further_down + right * further_right > 0
-
-
-@helper
-def _lay_out(cols, start, end, directions, at):
-    """Writes the steps along the cells that a segment crosses, from index `at` on; returns the index behind
-    them."""
-    down, right = end // cols - start // cols, end % cols - start % cols
-    rows_left, cols_left = abs(down), abs(right)
-    whole = 2 * max(rows_left, 1) * max(cols_left, 1)
-    next_row = max(cols_left, 1) if rows_left else whole
-    next_col = max(rows_left, 1) if cols_left else whole
-    straight_down, straight_right = np.uint8(4 if down > 0 else 0), np.uint8(2 if right > 0 else 6)
-    if down > 0:
-        both = np.uint8(3 if right > 0 else 5)
-    else:
-        both = np.uint8(1 if right > 0 else 7)
-    while next_row < whole or next_col < whole:
-        if next_row == next_col:
-            directions[at] = both
-        else:
-            directions[at] = straight_down if next_row < next_col else straight_right
-        on_row, on_col = next_row <= next_col, next_col <= next_row
-        if on_row:
-            next_row += 2 * max(cols_left, 1)
-        if on_col:
-            next_col += 2 * max(rows_left, 1)
-        at += 1
-    return at
 
 
 @step_kernel(
@@ -226,7 +213,7 @@ def pull_routes(pace, flight, offsets, corners, routes, scratch, pulled, prices)
                 start, end = cells[turns[first]], cells[turns[i]]
                 down, right = end // cols - start // cols, end % cols - start % cols
                 prices[2, n] += math.sqrt(np.float64(down * down + right * right))
-                until = _lay_out(cols, start, end, out, at)
+                _, until = _drive(pace, flight, cols, corners, start, end, np.inf, out, at)
                 legs[many] = until - at
                 at, many, first = until, many + 1, i
         begin = ends[n]

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from planner_service.kernels.decorators import helper, kernel
+from planner_service.kernels.decorators import kernel
 from planner_service.kernels.layout import BOX, INF
 
 CHEAPEST_S, DEAREST_S = np.float32(2.0**-40), np.float32(2.0**40)
@@ -27,36 +27,13 @@ BLOCK = 1 << 10
 """Cells of a block, whose range is kept."""
 
 
-@helper
-def _cell_cost(pace, resolution, extra):
-    """Returns the cost of a cell of this pace: between `CHEAPEST_S` and `DEAREST_S`, inf where it is lethal."""
-    cost = min(max(pace * resolution, CHEAPEST_S) + extra, DEAREST_S)
-    return cost if pace < INF else INF
-
-
-@kernel("(f4[:, ::1], f8, f8, i8, f4[::1])")
-def pad_cell_costs(pace, resolution, extra, stride, cell_cost):
-    """cell_cost := pace * resolution + extra, everywhere; resolution in m, extra in s. Returns how many cells have
-    a pace that is NaN, zero or negative, and how many cost `CHEAPEST_S` or `DEAREST_S`."""
-    resolution, extra = np.float32(resolution), np.float32(extra)
-    bad = 0
-    bounded = 0
-    for row in range(pace.shape[0]):
-        base = np.uint64((row + 1) * stride + 1)
-        for col in range(np.uint64(pace.shape[1])):
-            p = pace[row, col]
-            c = _cell_cost(p, resolution, extra)
-            bad += not p > 0
-            bounded += p < INF and ((c == CHEAPEST_S) | (c == DEAREST_S))
-            cell_cost[base + col] = c
-    return bad, bounded
-
-
 @kernel(f"(f4[:, ::1], f8, f8, {BOX}, i8, f4[::1], i8[::1], f4[::1])")
 def changed_cells(pace, resolution, extra, box, stride, cell_cost, cells, before):
-    """Updates the cell costs of a window, and list what changed.
+    """Updates the cell costs of a window, and lists what changed: pace * resolution + extra, between `CHEAPEST_S`
+    and `DEAREST_S`, inf where a cell is lethal.
 
     pace           none of the window is NaN, zero or negative
+    resolution     m; extra: s
     cells, before  int64 padded cells and float32 cost before, written; both have room for the whole window
     Returns how many cells have changed.
     """
@@ -66,7 +43,8 @@ def changed_cells(pace, resolution, extra, box, stride, cell_cost, cells, before
     for row in range(row0, row1):
         base = (row + 1) * stride + 1
         for col in range(col0, col1):
-            new = _cell_cost(pace[row, col], resolution, extra)
+            p = pace[row, col]
+            new = min(max(p * resolution, CHEAPEST_S) + extra, DEAREST_S) if p < INF else INF
             old = cell_cost[base + col]
             if new != old:
                 cells[count] = base + col
@@ -74,13 +52,6 @@ def changed_cells(pace, resolution, extra, box, stride, cell_cost, cells, before
                 count += 1
                 cell_cost[base + col] = new
     return count
-
-
-@kernel("(i4[::1], i8[::1])")
-def count_classes(bits, counts):
-    """Adds to `counts` (int64, 1 << 11) how many cell costs begin with the same 11 bits."""
-    for i in range(bits.size):
-        counts[np.uint64(bits[i] >> 20)] += 1
 
 
 @kernel("(i4[::1], i8[::1], i4[:, ::1])")

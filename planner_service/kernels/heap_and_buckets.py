@@ -27,7 +27,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from planner_service.kernels.decorators import helper, kernel
-from planner_service.kernels.layout import INF
+from planner_service.kernels.layout import INF, WALL
 
 
 @helper
@@ -126,6 +126,13 @@ def make_queue(entries: int, buckets: int) -> Queue:
     link, spare = np.empty(chunks, np.uint32), np.empty(chunks, np.uint32)
     head, tail = np.empty(buckets, np.uint64), np.empty(buckets, np.uint64)
     return pool, link, spare, head, tail, np.empty(2, np.uint64)
+
+
+@helper
+def open_costs(cell_cost, cost):
+    """Before a growth: inf on passable cells, WALL on the others."""
+    for i in range(cell_cost.size):
+        cost[i] = INF if cell_cost[i] < INF else WALL
 
 
 @helper

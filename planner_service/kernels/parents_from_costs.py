@@ -29,6 +29,7 @@ from planner_service.kernels.layout import (
 )
 
 _ONE = np.uint64(1)
+_ZERO8, _ONE8, _TWO8, _THREE8, _FOUR8, _FIVE8, _SIX8, _SEVEN8 = (np.uint8(k) for k in range(8))
 
 
 @helper
@@ -40,34 +41,22 @@ def least_offers(cell_cost, cost, s, first, last, step, limit, parent, least):
     least   s; written from its first element on; None if not needed
     """
     for i in range(first, last):
-        north, east, south, west = cell_cost[i - s], cell_cost[i + _ONE], cell_cost[i + s], cell_cost[i - _ONE]
-        best = cost[i - s] + north
-        code = np.uint8(0)
-        key = cost[i + _ONE] + east
-        code = np.uint8(2) if key < best else code
-        best = min(best, key)
-        key = cost[i + s] + south
-        code = np.uint8(4) if key < best else code
-        best = min(best, key)
-        key = cost[i - _ONE] + west
-        code = np.uint8(6) if key < best else code
-        best = min(best, key)
-        key = cost[i - s + _ONE] + cell_cost[i - s + _ONE] * step
-        key = key if max(north, east) <= limit else INF
-        code = np.uint8(1) if key < best else code
-        best = min(best, key)
-        key = cost[i + s + _ONE] + cell_cost[i + s + _ONE] * step
-        key = key if max(south, east) <= limit else INF
-        code = np.uint8(3) if key < best else code
-        best = min(best, key)
-        key = cost[i + s - _ONE] + cell_cost[i + s - _ONE] * step
-        key = key if max(south, west) <= limit else INF
-        code = np.uint8(5) if key < best else code
-        best = min(best, key)
-        key = cost[i - s - _ONE] + cell_cost[i - s - _ONE] * step
-        key = key if max(north, west) <= limit else INF
-        code = np.uint8(7) if key < best else code
-        best = min(best, key)
+        north, east, south, west = i - s, i + _ONE, i + s, i - _ONE
+        best, code = INF, _ZERO8
+        for k, u in ((_ZERO8, north), (_TWO8, east), (_FOUR8, south), (_SIX8, west)):
+            key = cost[u] + cell_cost[u]
+            code = k if key < best else code
+            best = min(best, key)
+        for k, u, one, other in (
+            (_ONE8, north + _ONE, north, east),
+            (_THREE8, south + _ONE, south, east),
+            (_FIVE8, south - _ONE, south, west),
+            (_SEVEN8, north - _ONE, north, west),
+        ):
+            key = cost[u] + cell_cost[u] * step
+            key = key if max(cell_cost[one], cell_cost[other]) <= limit else INF
+            code = k if key < best else code
+            best = min(best, key)
         if parent is not None:
             parent[i] = code if max(cost[i], best) < INF else NONE
         if least is not None:

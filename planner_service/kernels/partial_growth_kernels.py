@@ -26,21 +26,6 @@ def _cost_in(crop, box, row, col):
     return c if c >= 0 else INF
 
 
-@kernel("(u4[::1], i8)")
-def box_of(cells, stride):
-    """The box of some padded cells, at least one. Divides in float64, which vectorises and is exact here."""
-    row0 = col0 = np.int32((1 << 31) - 1)
-    row1 = col1 = np.int32(0)
-    share = 1.0 / stride
-    for i in range(cells.size):
-        v = np.int32(cells[i])
-        row = np.int32((v + 0.5) * share)
-        col = np.int32(v - row * np.int32(stride))
-        row0, row1 = min(row0, row), max(row1, row)
-        col0, col1 = min(col0, col), max(col1, col)
-    return row0, col0, row1 + 1, col1 + 1
-
-
 @kernel(f"({GRID}, {BOX}, f4[:, ::1], i8[::1], f4[::1], f8, i8[::1], UniTuple(f8, 2), u1[::1])")
 def stays_exact(grid, box, crop, cells, before, bound, route, known, mark):
     """Looks at changes of the map since a tree was cut out.

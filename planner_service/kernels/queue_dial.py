@@ -19,7 +19,9 @@ Arrays, beside those of `layout`:
     state    int64   (5,)            the last bucket served; entries that wait in the queue; how many of `touched`
                                      were put into it; how many there are; 1 if cells were left out, else 0.
                                      (0, 0, 0, 1, 0) where a growth begins, with a cost of 0 for the root, the
-                                     first of `touched`
+                                     first of `touched`. (b, 0, m, n, 0) where one goes on from n cells with a cost,
+                                     all whose cost falls into bucket b or less; the first m of them have no
+                                     neighbour without one
 
 The form of the loops was measured, and small changes cost much. Cells are touched without branches, sorted into
 buckets in two passes (which bucket, then where in it: in one, each store had the next cell's loads wait), and taken
@@ -37,7 +39,7 @@ from numpy.typing import NDArray
 
 from planner_service.kernels import layout
 from planner_service.kernels.decorators import helper, kernel, prefetch
-from planner_service.kernels.heap_and_buckets import QUEUE, Queue, empty, make_queue, put, take
+from planner_service.kernels.heap_and_buckets import QUEUE, Queue, empty, make_queue, open_costs, put, take
 
 _ONE = np.uint64(1)
 _ZERO = np.uint64(0)
@@ -54,21 +56,6 @@ _DETOUR = np.float32(0.4142135)
 """Least that a diagonal octile step costs beyond a straight one, in straight ones."""
 _AIM = "Tuple((f4, f4, f4[:, ::1]))"
 _SCRATCH = f"Tuple((u4[::1], u4[::1], {QUEUE}))"
-
-
-@helper
-def open_costs(cell_cost, cost):
-    """Before a growth: inf on passable cells, WALL on the others."""
-    for i in range(cell_cost.size):
-        cost[i] = layout.INF if cell_cost[i] < layout.INF else layout.WALL
-
-
-@helper
-def close_costs(cost):
-    """After a growth: inf on lethal cells too."""
-    for i in range(cost.size):
-        c = cost[i]
-        cost[i] = c if c >= _ZERO32 else layout.INF
 
 
 Scratch = tuple[NDArray[np.uint32], NDArray[np.uint32], Queue]
@@ -92,83 +79,45 @@ def _choose(cell_cost, cost, length, inverse, least, cells, count, buckets):
 
 
 @helper
-def _ask_for(cell_cost, cost, s, u):
-    prefetch(cell_cost, u)
-    prefetch(cost, u - s)
-    prefetch(cost, u)
-    prefetch(cost, u + s)
+def _offer(grid, cost, straight, slanted, batch, n, touched, count):
+    """Offer their exit keys to four or eight neighbours. Writes the cells that had no cost yet behind the `count`
+    that are in `touched`; returns how many there are.
 
-
-@helper
-def offer_straight(cell_cost, cost, s, batch, n, touched):
-    """Offer their exit keys to four neighbours. Writes the cells that had no cost yet to `touched`; returns how
-    many."""
-    count = _ZERO
+    straight, slanted  length of such steps; None: those neighbours are offered nothing. Paper steps take both in
+                       one pass over the batch, which `./launch_scripts/bench peers` shows to be a fifth faster
+                       than one after the other
+    """
+    cell_cost, _, stride, _, corners = grid
+    s = np.uint64(stride)
     for p in range(n):
-        _ask_for(cell_cost, cost, s, np.uint64(batch[p + np.uint64(AHEAD)]))
+        ahead = np.uint64(batch[p + np.uint64(AHEAD)])
+        prefetch(cell_cost, ahead)
+        prefetch(cost, ahead - s)
+        prefetch(cost, ahead)
+        prefetch(cost, ahead + s)
         u = np.uint64(batch[p])
-        key = cost[u] + cell_cost[u]
-        north, west, east, south = cost[u - s], cost[u - _ONE], cost[u + _ONE], cost[u + s]
-        for i, old in ((u - s, north), (u - _ONE, west), (u + _ONE, east), (u + s, south)):
-            cost[i] = min(old, key)
-            touched[count] = i
-            count += np.uint64(old == layout.INF)
-    return count
-
-
-@helper
-def offer_diagonal(cell_cost, cost, s, corners, batch, n, touched, count):
-    """Like `offer_straight`, to the diagonal neighbours of octile steps; there are `count` in `touched` already."""
-    for p in range(n):
-        _ask_for(cell_cost, cost, s, np.uint64(batch[p + np.uint64(AHEAD)]))
-        u = np.uint64(batch[p])
-        key = cost[u] + cell_cost[u] * layout.SQRT2
         above = u - s
         below = u + s
         north, west, east, south = cost[above], cost[u - _ONE], cost[u + _ONE], cost[below]
-        around = (
-            (above - _ONE, cost[above - _ONE], min(north, west)),
-            (above + _ONE, cost[above + _ONE], min(north, east)),
-            (below - _ONE, cost[below - _ONE], min(south, west)),
-            (below + _ONE, cost[below + _ONE], min(south, east)),
-        )
-        # inf past a wall. inf - inf is no number, and no match: a shut diagonal touches nothing.
-        for i, old, gate in around:
-            offer = key if corners else max(key, -gate)
-            cost[i] = min(old, offer)
-            touched[count] = i
-            count += np.uint64(old - offer == layout.INF)
-    return count
-
-
-@helper
-def offer_around(cell_cost, cost, s, corners, batch, n, touched):
-    """Like `offer_straight`, to eight neighbours, all a step of length 1 away: paper steps in one pass over the
-    batch, which `./launch_scripts/bench peers` shows to be a fifth faster than straight and diagonal ones one after
-    the other."""
-    count = _ZERO
-    for p in range(n):
-        _ask_for(cell_cost, cost, s, np.uint64(batch[p + np.uint64(AHEAD)]))
-        u = np.uint64(batch[p])
-        key = cost[u] + cell_cost[u]
-        above = u - s
-        below = u + s
-        north, west, east, south = cost[above], cost[u - _ONE], cost[u + _ONE], cost[below]
-        around = (
-            (above - _ONE, cost[above - _ONE], min(north, west)),
-            (above + _ONE, cost[above + _ONE], min(north, east)),
-            (below - _ONE, cost[below - _ONE], min(south, west)),
-            (below + _ONE, cost[below + _ONE], min(south, east)),
-        )
-        for i, old in ((above, north), (u - _ONE, west), (u + _ONE, east), (below, south)):
-            cost[i] = min(old, key)
-            touched[count] = i
-            count += np.uint64(old == layout.INF)
-        for i, old, gate in around:
-            offer = key if corners else max(key, -gate)
-            cost[i] = min(old, offer)
-            touched[count] = i
-            count += np.uint64(old - offer == layout.INF)
+        if straight is not None:
+            key = cost[u] + cell_cost[u] * straight
+            for i, old in ((above, north), (u - _ONE, west), (u + _ONE, east), (below, south)):
+                cost[i] = min(old, key)
+                touched[count] = i
+                count += np.uint64(old == layout.INF)
+        if slanted is not None:
+            key = cost[u] + cell_cost[u] * slanted
+            # inf past a wall. inf - inf is no number, and no match: a shut diagonal touches nothing.
+            for i, old, gate in (
+                (above - _ONE, cost[above - _ONE], min(north, west)),
+                (above + _ONE, cost[above + _ONE], min(north, east)),
+                (below - _ONE, cost[below - _ONE], min(south, west)),
+                (below + _ONE, cost[below + _ONE], min(south, east)),
+            ):
+                offer = key if corners else max(key, -gate)
+                cost[i] = min(old, offer)
+                touched[count] = i
+                count += np.uint64(old - offer == layout.INF)
     return count
 
 
@@ -217,7 +166,7 @@ def _leave_out(grid, cost, cells, count, aim, asker):
 
 @kernel(f"({layout.GRID}, f4[::1], {layout.BUCKETS}, {_SCRATCH}, i8[::1], i8[::1], i8, {_AIM})")
 def grow_by_buckets(grid, cost, buckets, scratch, state, askers, most, aim):
-    """Costs to a root. Goes on from `state`, which `resume` or an earlier call left, or begins.
+    """Costs to a root. Goes on from `state`, which an earlier call left, or begins.
 
     buckets  width: below the lowest cell cost, s, so that nothing in a bucket leads back into it. count: of the
              circular queue, a power of two; count * width exceeds the costliest step by two widths
@@ -232,11 +181,10 @@ def grow_by_buckets(grid, cost, buckets, scratch, state, askers, most, aim):
     With octile steps a cell waits twice, under its straight exit key in the first `count` buckets and under its
     diagonal one in as many behind them.
     """
-    cell_cost, _, stride, rule, corners = grid
+    cell_cost, rule = grid[0], grid[3]
     touched, batch, queue = scratch
     width, circle = buckets
     head, tail = queue[3], queue[4]
-    s = np.uint64(stride)
     length = np.uint64(circle)
     mask = length - _ONE
     second = length if rule == layout.RULE_OCTILE else _ZERO
@@ -246,7 +194,7 @@ def grow_by_buckets(grid, cost, buckets, scratch, state, askers, most, aim):
         cost[np.uint64(askers[0])] = _ZERO32
         touched[0] = askers[0]
         state[0], state[1], state[2], state[3], state[4] = 0, 0, 0, 1, 0
-    if state[2] == 0:
+    if state[1] == 0:
         empty(queue, 2 * circle if rule == layout.RULE_OCTILE else circle)
     current = np.int32(state[0])
     waiting, filed, total = np.uint64(state[1]), np.uint64(state[2]), np.uint64(state[3])
@@ -276,17 +224,18 @@ def grow_by_buckets(grid, cost, buckets, scratch, state, askers, most, aim):
         n = take(queue, b, batch)
         waiting -= n
         if rule == layout.RULE_PAPER:
-            count = offer_around(cell_cost, cost, s, corners, batch, n, fresh)
-        else:
-            count = offer_straight(cell_cost, cost, s, batch, n, fresh)
+            total += _offer(grid, cost, _ONE32, _ONE32, batch, n, fresh, _ZERO)
+            continue
+        count = _offer(grid, cost, _ONE32, None, batch, n, fresh, _ZERO)
         if rule == layout.RULE_OCTILE:
             n = take(queue, b + length, batch)
             waiting -= n
-            count = offer_diagonal(cell_cost, cost, s, corners, batch, n, fresh, count)
+            count = _offer(grid, cost, None, layout.SQRT2, batch, n, fresh, count)
         total += count
     state[0], state[1], state[2], state[3] = current, waiting, filed, total
     if most == WHOLE:
-        close_costs(cost)
+        for i in range(cost.size):
+            cost[i] = abs(cost[i])  # inf of a wall
     return current if current <= 1 << 20 or waiting == _ZERO else layout.TOO_FINE
 
 
@@ -301,41 +250,3 @@ def begin(cost, touched, state, root):
     state[:] = 0
     if root >= 0:
         cost[root], touched[0], state[3] = _ZERO32, root, 1
-
-
-@kernel(f"({layout.GRID}, f4[::1], {layout.BUCKETS}, {_SCRATCH}, i8[::1], {layout.BOX}, f4[:, ::1], i8)")
-def resume(grid, cost, buckets, scratch, state, box, crop, first):
-    """Goes back to a tree that was cut out (see `partial_growth_kernels`): to its costs in buckets below `first`,
-    which are exact on the map as it is. Costlier cells are left to `grow_by_buckets`. `cost` is inf and WALL."""
-    cell_cost, _, stride, rule, _ = grid
-    width, circle = buckets
-    touched, batch, queue = scratch
-    row0, col0, row1, col1 = box
-    inverse = _ONE32 / np.float32(width)
-    length = np.uint64(circle)
-    mask = length - _ONE
-    empty(queue, 2 * circle if rule == layout.RULE_OCTILE else circle)
-    total = _ZERO
-    waiting = _ZERO
-    for row in range(row0, row1):
-        for col in range(col0, col1):
-            c = crop[row - row0, col - col0]
-            v = np.uint64(row * stride + col)
-            if (
-                not (c >= _ZERO32 and c < layout.INF and cell_cost[v] < layout.INF)
-                or np.int32(c * inverse) >= first
-            ):
-                continue
-            cost[v] = c
-            touched[total] = v
-            one = touched[total:]
-            total += _ONE
-            batch[0] = np.int32((c + cell_cost[v]) * inverse)
-            if batch[0] >= first:
-                put(queue, one, _ONE, batch, mask, _ZERO)
-                waiting += _ONE
-            batch[0] = np.int32((c + cell_cost[v] * layout.SQRT2) * inverse)
-            if rule == layout.RULE_OCTILE and batch[0] >= first:
-                put(queue, one, _ONE, batch, mask, length)
-                waiting += _ONE
-    state[0], state[1], state[2], state[3], state[4] = first - 1, waiting, total, total, 0

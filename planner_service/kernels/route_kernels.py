@@ -213,55 +213,31 @@ def _cheapest_way(grid, cost, beside, v, at):
     return way
 
 
-@kernel(f"({GRID}, f4[::1], i8, i8[::1], u1[::1], u4[::1], i8)")
-def point_routes(grid, cost, root, starts, parent, pointed, count):
+@kernel(f"({GRID}, {BOX}, f4[::1], i8, i8[::1], u1[::1], u4[::1], i8)")
+def point_routes(grid, box, cost, root, starts, parent, pointed, count):
     """Writes the parents of the cells on the routes from padded, passable cells to the root, of those which have
     one.
 
-    cost     of a growth that has stopped: exact, inf where a cell has none, WALL where it is lethal
+    box   of a growth that has stopped, padded rows and columns; row1 and col1 lie outside. It holds all starts, and
+          all neighbours of a cell with a cost
+    cost  of the cells of the box, row by row: exact costs, inf where a cell has none, WALL where it is lethal
     pointed  uint32 (size,), the cells which have a parent, `count` until now. Those with new ones are put behind
     Returns how many there are.
     """
-    offsets = grid[1]
-    for i in range(starts.size):
-        v = starts[i]
-        while cost[v] < INF and v != root and parent[v] == NONE:
-            parent[v] = _cheapest_way(grid, cost, offsets, v, v)
-            pointed[count] = v
-            count += 1
-            v += offsets[parent[v]]
-    return count
-
-
-@kernel(f"({GRID}, {BOX}, f4[::1], f4[::1], UniTuple(i8, 3), u1[::1])")
-def walk_by_costs(grid, box, crop, time_cost, ends, directions):
-    """Writes the directions of a cheapest route by costs alone; of equals the first as in `parents_from_costs`.
-
-    crop       one row of it after the other. All neighbours of a cell with a cost lie in the box
-    time_cost  float32 (size,), s, of a straight step into a padded cell
-    ends       padded cells, a start that has a cost and the root; and the number of steps of the first part
-    Returns the steps, or -1 if it does not end at the root within as many as have room; diagonal ones of the first
-    part; what it takes, s, all and the first part.
-    """
-    _, offsets, stride, rule, _ = grid
-    v, root, part = ends
+    _, offsets, stride, _, _ = grid
     row0, col0, _, col1 = box
     width = col1 - col0
     beside = (-width, 1 - width, 1, width + 1, width, width - 1, -1, -width - 1)
-    at = (v // stride - row0) * width + v % stride - col0
-    n = slanted = 0
-    driven = first = 0.0
-    while v != root:
-        way = _cheapest_way(grid, crop, beside, v, at)
-        if way == NONE or n == directions.size:
-            return -1, 0, 0.0, 0.0
-        directions[n] = way
-        n += 1
-        v += offsets[way]
-        at += beside[way]
-        step = np.float64(time_cost[v]) * (SQRT2_EXACT if way & 1 and rule == RULE_OCTILE else 1.0)
-        driven += step
-        if n <= part:
-            first += step
-            slanted += way & 1
-    return n, slanted, driven, first
+    for i in range(starts.size):
+        v = starts[i]
+        at = (v // stride - row0) * width + v % stride - col0
+        while cost[at] < INF and v != root and parent[v] == NONE:
+            way = _cheapest_way(grid, cost, beside, v, at)
+            if way == NONE:  # a bug, which the reader of the route notices
+                break
+            parent[v] = way
+            pointed[count] = v
+            count += 1
+            v += offsets[way]
+            at += beside[way]
+    return count

@@ -156,48 +156,11 @@ def find_ways_to_centres(grid, node, centre, cost, parent, depth, heap):
                     size = heap_lower(keys, items, place, size, offer, v)
 
 
-@kernel(f"({GRID}, i4[::1], f4[::1], i8, i8[::1], f4[::1], i8[::1])")
-def join_nodes(grid, node, cost, nodes, pairs, prices, steps):
-    """Finds all links, each with its cheapest step.
-
-    pairs   int64, a power of two, 0: a hash table; written: lower node * `nodes` + higher node + 1
-    prices  float32, s, of the same size; written: of the way through the step
-    steps   int64, of the same size; written: 8 * padded cell + direction
-    Returns how many links there are, or -1 where they fill more than half of the table: a larger one is to be
-    handed in.
-    """
-    cell_cost, offsets, _, rule, corners = grid
-    mask = pairs.size - 1
-    found = 0
-    for u in range(node.size):
-        if node[u] < 0:
-            continue
-        for k in range(2, 6, 2 if rule == RULE_FOUR else 1):  # east to south-west: each pair of cells once
-            v = u + offsets[k]
-            if node[v] == node[u] or node[v] < 0 or not _leads(cell_cost, offsets, corners, u, k):
-                continue
-            pair = np.int64(min(node[u], node[v])) * nodes + max(node[u], node[v]) + 1
-            at = (pair * 0x9E3779B97F4A7C1 >> 20) & mask
-            while pairs[at] != 0 and pairs[at] != pair:
-                at = (at + 1) & mask
-            price = cost[u] + cost[v] + cell_cost[u] * step_length(rule, k & 1) + cell_cost[v]
-            if pairs[at] == 0:
-                pairs[at] = pair
-                prices[at] = INF
-                found += 1
-                if 2 * found > pairs.size:
-                    return -1
-            if price < prices[at]:
-                prices[at] = price
-                steps[at] = 8 * u + k
-    return found
-
-
 @kernel("(i8[::1], u1[::1], i4[::1], i8[::1], i8[::1], u1[::1], u4[::1], i4[::1])")
 def write_paths(offsets, parent, depth, steps, begins, paths, centre, node):
     """Writes the ways of links, from the centre of the node that the step leaves to that of the other.
 
-    steps   int64, as `join_nodes` writes them; less than 0: ~padded cell, where the way ends
+    steps   int64, of each link 8 * padded cell + direction; less than 0: ~padded cell, where the way ends
     begins  int64, where each begins in `paths`
     node    written: OPEN on all ways and centres, -1 elsewhere, which is what the next stride is cut from
     """

@@ -11,7 +11,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
-from planner_service.kernels.cell_costs import BLOCK, block_ranges, count_classes
+from planner_service.kernels.cell_costs import BLOCK, block_ranges
 from shared_map.array_files import Floats
 
 Cells = NDArray[np.int64]
@@ -77,6 +77,8 @@ class CostRange:
 
 _MANY = 1 << 11
 """Classes: all that 11 bits name."""
+_PART = 1 << 20
+"""Cells that are classed at a time: `bincount` takes 12 bytes for each."""
 _LETHAL = 0x7F8
 """The class of inf."""
 
@@ -96,7 +98,8 @@ class Rounding:
     def of(cls, cell_cost: Floats) -> Self:
         """Returns the rounding of a map; of no cells, before there is one."""
         classes = np.zeros(_MANY, np.int64)
-        count_classes(cell_cost.view(np.int32), classes)
+        for part in np.array_split(cell_cost.view(np.int32), cell_cost.size // _PART + 1):
+            classes += np.bincount(part >> 20, minlength=_MANY)
         return cls(classes)
 
     def after(self, changes: Changes) -> Self:

@@ -64,6 +64,8 @@ _BLOCK = 1 << 10
 """Cells that are copied at a time: a page of memory."""
 _FEWEST, _MOST = 1 << 9, 1 << 14
 """Buckets of a repair."""
+_BAND = 1 << 8
+"""Rows of a map that are taken in at a time."""
 _SMALL = 1 << 20
 """Padded cells of a small map."""
 
@@ -147,6 +149,11 @@ class CostGrid:
         return self.cell_cost, self._offsets, self.stride, self.rule, self.corners
 
     @property
+    def padded_box(self) -> tuple[int, int, int, int]:
+        """All padded rows and columns."""
+        return 0, 0, self.grid.rows + 2, self.stride
+
+    @property
     def lowest_cell_cost(self) -> float:
         """s; inf if all is lethal."""
         return self._range.lowest
@@ -196,9 +203,10 @@ class CostGrid:
         A cell costs between `CHEAPEST_S` and `DEAREST_S`, whatever its pace is; the log says where that holds.
         """
         check_pace(self.grid, pace)
-        cell_cost, bad, bounded = self._padded(pace, self.length_weight_s)
-        if bad:
+        if not (pace > 0).all():
             raise ValueError(said_of_bad(pace, self.grid.window))
+        cell_cost = self._padded(pace, self.length_weight_s)
+        bounded = sum(np.count_nonzero(cell_cost == each) for each in (kernels.CHEAPEST_S, kernels.DEAREST_S))
         if bounded:
             log.warning(
                 "%d of %d cells cost %.2g s or %.2g s, the least and the most that a cell can cost",
@@ -207,13 +215,15 @@ class CostGrid:
         self._shared = None
         self.cell_cost = cell_cost
         if self.length_weight_s:
-            self._time_cost, _, _ = self._padded(pace, 0.0)
+            self._time_cost = self._padded(pace, 0.0)
         self._find_range()
         self.rounding = Rounding.of(self.cell_cost)
 
-    def _padded(self, pace: Floats, extra_s: float) -> tuple[Floats, int, int]:
+    def _padded(self, pace: Floats, extra_s: float) -> Floats:
         costs: Floats = np.full(self.size, np.inf, np.float32)
-        return costs, *kernels.pad_cell_costs(pace, self.metres, extra_s, self.stride, costs)
+        for row in range(0, self.grid.rows, _BAND):  # in parts: all changes of a large map are much memory
+            self._taken(pace, (row, 0, min(row + _BAND, self.grid.rows), self.grid.cols), extra_s, costs)
+        return costs
 
     @property
     def time_cost(self) -> Floats:
@@ -295,12 +305,12 @@ class CostGrid:
             if not (pace[row0:row1, col0:col1] > 0).all():
                 raise ValueError(said_of_bad(pace, Window(row0, col0, row1, col1)))
         # A cell in two overlapping windows changes in the first only, so there is no repetition.
-        found = [self._changed(pace, box, self.length_weight_s, self.cell_cost) for box in boxes]
+        found = [self._taken(pace, box, self.length_weight_s, self.cell_cost) for box in boxes]
         if self._time_cost is not None:
             # A change of time may be too small to be seen in a cost that holds the price of length, too.
-            timed = [self._changed(pace, box, 0.0, self._time_cost).cells for box in boxes]
+            timed = [self._taken(pace, box, 0.0, self._time_cost)[0] for box in boxes]
             self._time_range = self._time_range.after(self._time_cost, np.concatenate(timed))
-        changes = joined(found)
+        changes = joined([Changes(cells, before, self.cell_cost[cells]) for cells, before in found])
         if not changes.cells.size:
             return NO_CHANGES
         self._written[changes.cells // _BLOCK] = True
@@ -308,17 +318,21 @@ class CostGrid:
         self._range = self._range.after(self.cell_cost, changes.cells)
         return changes
 
-    def _changed(self, pace: Floats, box: tuple[int, int, int, int], extra_s: float, costs: Floats) -> Changes:
-        """Takes a window into the padded costs, `cell_cost` or `time_cost`."""
+    def _taken(
+        self, pace: Floats, box: tuple[int, int, int, int], extra_s: float, costs: Floats
+    ) -> tuple[Cells, Floats]:
+        """Takes a window into the padded costs, `cell_cost` or `time_cost`. Returns the cells that changed, and
+        what they cost before."""
         row0, col0, row1, col1 = box
         most = (row1 - row0) * (col1 - col0)
         cells, before = np.empty(most, np.int64), np.empty(most, np.float32)
         count = kernels.changed_cells(pace, self.metres, extra_s, box, self.stride, costs, cells, before)
-        return Changes(cells[:count], before[:count], costs[cells[:count]])
+        return cells[:count], before[:count]
 
-    def window_of(self, cells: Cells) -> Window:
+    def window_of(self, cells: Cells | NDArray[np.uint32]) -> Window:
         """The least window that holds these padded cells, one at least."""
-        rows, cols = np.divmod(cells, self.stride)
+        rows = cells // self.stride
+        cols = cells - rows * self.stride  # both vectorise, unlike a remainder
         return Window(int(rows.min()) - 1, int(cols.min()) - 1, int(rows.max()), int(cols.max()))
 
     def _boxes(self, windows: Sequence[Window]) -> Iterator[tuple[int, int, int, int]]:

@@ -10,8 +10,8 @@ from numpy.typing import NDArray
 
 from planner_service.kernels import queue_dial
 from planner_service.kernels.layout import NONE, TOO_FINE, WALL
-from planner_service.kernels.partial_growth_kernels import box_of, find_aim, stays_exact
-from planner_service.kernels.route_kernels import walk_by_costs
+from planner_service.kernels.partial_growth_kernels import find_aim, stays_exact
+from planner_service.kernels.route_kernels import point_routes
 from planner_service.tree.cost_changes import Cells, Changes
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.queue_choice import NARROW
@@ -123,7 +123,7 @@ class PartialGrowth:
     def resume(self, tree: CutTree, level: float) -> None:
         """Takes up a tree that was cut out, of which all that costs less than `level` (s) is as it was."""
         self.forget()
-        scratch = self._room()
+        touched, *_ = self._room()
         level = min(level, tree.bound)
         if level == tree.bound < math.inf and self._width == tree.width:
             first = round(level / self._width)
@@ -132,10 +132,16 @@ class PartialGrowth:
         if first < 1:
             self.begin(tree.root)
             return
-        grid, buckets = self._grid.padded, (self._width, self._circle)
-        queue_dial.resume(grid, self.cost, buckets, scratch, self._state, tree.box, tree.cost, first)
-        self.root = tree.root
-        self._find_bound()
+        (row0, col0, row1, col1), stride = tree.box, self._grid.stride
+        inverse, end = np.float32(1.0) / np.float32(self._width), np.float32(first)
+        own = self._grid.cell_cost.reshape(-1, stride)[row0:row1, col0:col1]
+        rows, cols = kept = np.nonzero((tree.cost >= 0) & (tree.cost * inverse < end) & (own < np.inf))
+        cells, costs = (rows + row0) * stride + cols + col0, tree.cost[kept]
+        self.cost[cells] = costs
+        inner = (costs + own[kept] * np.float32(self._grid.diagonal)) * inverse < end
+        touched[: cells.size] = np.concatenate((cells[inner], cells[~inner]))
+        self._state[:] = first - 1, 0, np.count_nonzero(inner), cells.size, 0
+        self.root, self.bound = tree.root, self.reach
 
     def aim_at(self, askers: Cells, root: int, parent: NDArray[np.uint8]) -> queue_dial.Aim:
         """Returns the aim of the next growth, from a padded, passable root to such cells, which it sorts. None
@@ -176,10 +182,9 @@ class PartialGrowth:
         """Returns the tree in hand, as an array of its own with a rim of cells without a cost. Then none is
         in hand."""
         assert self._scratch is not None
-        stride = self._grid.stride
-        row0, col0, row1, col1 = box_of(self._scratch[0][: self.touched], stride)
-        box = row0 - 1, col0 - 1, row1 + 1, col1 + 1
-        inner = self.cost.reshape(-1, stride)[box[0] : box[2], box[1] : box[3]]
+        held = self._grid.window_of(self._scratch[0][: self.touched])
+        box = held.row0, held.col0, held.row1 + 2, held.col1 + 2  # with one cell around, and padded
+        inner = self.cost.reshape(-1, self._grid.stride)[box[0] : box[2], box[1] : box[3]]
         tree = CutTree(self.root, box, inner.copy(), self.bound, self._width)
         self.forget()
         return tree
@@ -219,26 +224,26 @@ class PartialGrowth:
         return float(level), bool(stands)
 
 
-def way_of(costs: CostGrid, tree: CutTree, start: int, part: int, room: NDArray[np.uint8]) -> Way:
+Pointed = tuple[NDArray[np.uint8], NDArray[np.uint32]]
+"""Scratch of `way_of`: uint8 (size,), NONE; and room for the padded cells of a route."""
+
+
+def way_of(costs: CostGrid, tree: CutTree, start: int, part: int, pointed: Pointed) -> Way:
     """Returns a cheapest route from a padded cell that has a cost to the tree's root.
 
     part  steps of the part that is measured; 0 is the whole route
-    room  uint8, written: for as many steps as the longest route has
     """
-    if tree.parent is None:
-        ends = start, tree.root, part or room.size
-        steps, slanted, driven, first = walk_by_costs(
-            costs.padded, tree.box, tree.cost.reshape(-1), costs.time_cost, ends, room
-        )
-        if steps < 0:
-            raise AssertionError("a route does not end at the target: the tree is broken")
-        length = min(part or steps, steps) + slanted * (costs.diagonal - 1.0)
-        return Way(room[:steps].copy(), driven, driven - first, length * costs.grid.resolution_m)
-    whole, first_part = (
-        costs.walk(tree.parent, tree.root, np.array((start,)), most, costs.time_cost) for most in (0, part)
-    )
+    at, (parent, cells) = np.array((start,)), pointed
+    if tree.parent is not None:
+        parent, many = tree.parent, 0
+    else:
+        many = point_routes(costs.padded, tree.box, tree.cost.reshape(-1), tree.root, at, parent, cells, 0)
+    whole, first = (costs.walk(parent, tree.root, at, most, costs.time_cost) for most in (0, part))
+    parent[cells[:many]] = NONE
+    if whole.ends[0] < 0:
+        raise AssertionError("a route does not end at the target: the tree is broken")
     driven = float(whole.driven[0])
-    return Way(whole.directions, driven, driven - float(first_part.driven[0]), float(first_part.length[0]))
+    return Way(whole.directions, driven, driven - float(first.driven[0]), float(first.length[0]))
 
 
 def whole_tree(cost_grid: CostGrid, root: int) -> CutTree:
@@ -246,5 +251,4 @@ def whole_tree(cost_grid: CostGrid, root: int) -> CutTree:
     cost = np.empty(cost_grid.size, np.float32)
     parent = np.full(cost_grid.size, NONE, np.uint8)
     cost_grid.grow(root, cost, parent)
-    box = 0, 0, cost_grid.size // cost_grid.stride, cost_grid.stride
-    return CutTree(root, box, cost.reshape(box[2], box[3]), math.inf, 0.0, parent)
+    return CutTree(root, cost_grid.padded_box, cost.reshape(-1, cost_grid.stride), math.inf, 0.0, parent)

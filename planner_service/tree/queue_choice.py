@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from planner_service.kernels import queue_dial, queue_directed, queue_wide_buckets
+from planner_service.kernels import queue_dial, queue_levels
 from planner_service.kernels.climbs import Climbs
 from planner_service.kernels.layout import TOO_FINE, PaddedGrid
 from planner_service.kernels.parents_from_costs import point_to_parents, untie_parents
@@ -17,7 +17,7 @@ from planner_service.tree.cost_changes import CostRange
 from shared_map.array_files import Floats
 
 MOST_BUCKETS = 1 << 8
-"""Buckets are as narrow as the cheapest step: if the costliest takes more of them, their width follows the map."""
+"""Buckets are as narrow as the cheapest step, unless the costliest takes more of them."""
 NARROW = 0.98
 """Width of a bucket, in lowest cell costs, that no cell in it leads back into, whatever the rounding."""
 FINE = float(1 << 20)
@@ -56,15 +56,13 @@ def grow_tree(
                    growths
     """
     cell_cost, _, stride, _, _ = padded
-    size, lowest = cell_cost.size, bounds[0]
-    scratch_of = {} if kept is None else kept
-    if climbs is not None:
-        width, may_lead_back = _directed_width(cell_cost, *bounds[:2])
-        scratch = _scratch(scratch_of, (size, 0), lambda: queue_directed.make_scratch(size))
-        queue_directed.grow_directed_by_buckets(padded, cost, root, climbs, width, may_lead_back, scratch)
+    size, lowest, scratch_of = cell_cost.size, bounds[0], {} if kept is None else kept
+    reach = None if climbs is not None else _grow_narrow(padded, bounds, root, cost, scratch_of)
+    if reach is None:
+        width, may_lead_back = _finest_width(cell_cost, *bounds[:2])
+        scratch = _scratch(scratch_of, (size, 0), lambda: queue_levels.make_scratch(size))
+        queue_levels.grow_by_levels(padded, climbs, cost, root, width, may_lead_back, scratch)
         reach = math.inf if parent is None else CostRange(cost).highest
-    else:
-        reach = _grow_alike(padded, bounds, root, cost, scratch_of)
     if parent is None:
         return reach
     point_to_parents(padded, climbs, cost, root, (0, 0, size // stride - 2, stride - 2), parent)
@@ -74,23 +72,22 @@ def grow_tree(
     return reach
 
 
-def _grow_alike(padded: PaddedGrid, bounds: Bounds, root: int, cost: Floats, kept: KeptScratch) -> float:
-    """Costs where entering a cell costs the same from everywhere. Returns a bound, s, that none exceeds."""
+def _grow_narrow(padded: PaddedGrid, bounds: Bounds, root: int, cost: Floats, kept: KeptScratch) -> float | None:
+    """Costs by buckets as narrow as the cheapest step. Returns a bound, s, that none exceeds; None where it takes
+    too many buckets, or where costs become too large for float32."""
     size, rule, (lowest, highest, dearest) = padded[0].size, padded[3], bounds
     width = float(np.float32(lowest * NARROW))
     needed = highest * dearest / width + 3
-    if needed <= MOST_BUCKETS:
-        count = 1 << max(2, math.ceil(math.log2(needed)))
-        narrow = _scratch(kept, (size, count), lambda: queue_dial.make_scratch(size, rule, count))
-        state, at_once = np.empty(5, np.int64), (np.array((root,)), queue_dial.WHOLE, queue_dial.NO_AIM)
-        last = int(queue_dial.grow_by_buckets(padded, cost, (width, count), narrow, state, *at_once))
-        if last != TOO_FINE:
-            return (last + 1) * width
-    wide = _scratch(kept, (size, 0), lambda: queue_wide_buckets.make_scratch(size, rule))
-    return float(queue_wide_buckets.grow_by_wide_buckets(padded, cost, root, width, wide))
+    if needed > MOST_BUCKETS:
+        return None
+    count = 1 << max(2, math.ceil(math.log2(needed)))
+    scratch = _scratch(kept, (size, count), lambda: queue_dial.make_scratch(size, rule, count))
+    state, at_once = np.empty(5, np.int64), (np.array((root,)), queue_dial.WHOLE, queue_dial.NO_AIM)
+    last = int(queue_dial.grow_by_buckets(padded, cost, (width, count), scratch, state, *at_once))
+    return None if last == TOO_FINE else (last + 1) * width
 
 
-def _directed_width(cell_cost: Floats, lowest: float, highest: float) -> tuple[float, bool]:
+def _finest_width(cell_cost: Floats, lowest: float, highest: float) -> tuple[float, bool]:
     """Width (s) of the finest buckets, and whether some steps may cost less than that.
 
     Returns a width at which one level of buckets is as wide as the usual cell cost asks for, and the finest no
@@ -102,11 +99,11 @@ def _directed_width(cell_cost: Floats, lowest: float, highest: float) -> tuple[f
         rank = int(sample.size * _RARE)
         usual = float(np.partition(sample, rank)[rank]) if sample.size else lowest
         if usual > _NEAR * lowest:
-            width = usual * queue_directed.WIDTH
+            width = usual * queue_levels.WIDTH
             while width > lowest:
-                width /= 1 << queue_directed.BASE_BITS
+                width /= 1 << queue_levels.BASE_BITS
             return width, True
-    return lowest * queue_directed.WIDTH, False
+    return lowest * queue_levels.WIDTH, False
 
 
 def _scratch(kept: KeptScratch, key: tuple[int, int], make: Callable[[], Any]) -> Any:

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from planner_service.kernels import stride_networks
+from planner_service.kernels.layout import RULE_FOUR, RULE_OCTILE, SQRT2
 from planner_service.kernels.stride_networks import StrideNetwork
 from planner_service.tree.cost_changes import Cells
 from planner_service.tree.cost_grid import CostGrid
@@ -93,16 +94,29 @@ def find_stride(
 
 
 def _joining_steps(grid: CostGrid, node: NDArray[np.int32], cost: Floats, many: int) -> tuple[Cells, Floats]:
-    """The cheapest step of each link, and the price of its way, s; in the order of the map."""
-    room = 1 << (8 * many + 16).bit_length()
-    while True:
-        pairs, prices, steps = np.zeros(room, np.int64), np.empty(room, np.float32), np.empty(room, np.int64)
-        if stride_networks.join_nodes(grid.padded, node, cost, many, pairs, prices, steps) >= 0:
-            break
-        room *= 2
-    found = np.flatnonzero(pairs)
-    found = found[np.argsort(steps[found])]
-    return steps[found], prices[found]
+    """The cheapest step of each link, 8 * padded cell + direction, and the price of its way, s; in the order of the
+    map."""
+    cell_cost, offsets, _, rule, corners = grid.padded
+    steps: list[Cells] = []
+    pairs: list[Cells] = []
+    prices: list[Floats] = []
+    for way in range(2, 6, 2 if rule == RULE_FOUR else 1):  # east to south-west: each pair of cells once
+        ahead = int(offsets[way])
+        one, other = node[:-ahead], node[ahead:]
+        u = np.flatnonzero((one != other) & (one >= 0) & (other >= 0))
+        if way & 1 and not corners:
+            beside = np.maximum(cell_cost[u + offsets[way - 1]], cell_cost[u + offsets[way + 1]])
+            u = u[beside < np.inf]
+        v = u + ahead
+        length = SQRT2 if way & 1 and rule == RULE_OCTILE else np.float32(1.0)
+        steps.append(8 * u + way)
+        pairs.append(np.minimum(node[u], node[v]) * np.int64(many) + np.maximum(node[u], node[v]))
+        prices.append(cost[u] + cost[v] + cell_cost[u] * length + cell_cost[v])
+    step, pair, price = np.concatenate(steps), np.concatenate(pairs), np.concatenate(prices)
+    order = np.lexsort((step, price, pair))
+    best = order[np.unique(pair[order], return_index=True)[1]]
+    best = best[np.argsort(step[best])]
+    return step[best], price[best]
 
 
 def _joined(centres: list[NDArray[np.uint32]], links: list[Links]) -> StrideNetwork:

@@ -317,8 +317,10 @@ def encode_json(message: Message, key: str = "") -> bytes:
     key  for which it is meant, below the namespace
     """
     fields = _plain(message)
-    if isinstance(message, RouteReply | PlaceRouteReply):
-        fields["routes"] = [_plain(each) | _cells_row_col(each, message) for each in message.routes]
+    if isinstance(message, RouteReply):
+        fields["routes"] = [_plain(each) | _cells_row_col(each, message.cols) for each in message.routes]
+    elif isinstance(message, PlaceRouteReply):  # which does not tell the grid
+        fields["routes"] = [_plain(each) for each in message.routes]
     meant = {KEY_FIELD: key} if key else {}
     return msgspec.json.encode({"schema": schema_of_type(type(message))} | fields | meant)
 
@@ -436,10 +438,9 @@ def _quoted(given: Any) -> str:
     return text if len(text) <= _QUOTED else text[:_QUOTED] + " ..."
 
 
-def _cells_row_col(route: Route, reply: RouteReply | PlaceRouteReply) -> dict[str, list[list[int]]]:
-    if isinstance(reply, PlaceRouteReply):  # which does not tell the grid
-        return {}
-    row, col = divmod(route.start, reply.cols)
+def _cells_row_col(route: Route, cols: int) -> dict[str, list[list[int]]]:
+    """The cells that a route passes, on a grid with this number of columns."""
+    row, col = divmod(route.start, cols)
     cells = [[row, col]]
     for code in route.directions:
         row, col = row + STEP_ROW[code], col + STEP_COL[code]

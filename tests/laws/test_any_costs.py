@@ -22,7 +22,7 @@ from support.planner_strategies import RULES, STRATEGIES, open_cell, random_clim
 from planner_service import RouteFinder
 from planner_service.kernels.cell_costs import CHEAPEST_S, DEAREST_S
 from planner_service.kernels.layout import NONE
-from planner_service.kernels.queue_directed import grow_directed_by_buckets, make_scratch
+from planner_service.kernels.queue_levels import grow_by_levels, make_scratch
 from planner_service.target_tree import TargetTree
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
@@ -253,7 +253,7 @@ def test_costs_are_exact_whatever_the_width_of_the_buckets(ground: str, width: f
     costs = tree.cost_grid
     cost = np.empty(costs.size, np.float32)
     scratch = make_scratch(costs.size)
-    grow_directed_by_buckets(costs.padded, cost, costs.pad(root), costs.climbs, width, True, scratch)
+    grow_by_levels(costs.padded, costs.climbs, cost, costs.pad(root), width, True, scratch)
     np.testing.assert_array_equal(inner(tree, cost), best)
 
 

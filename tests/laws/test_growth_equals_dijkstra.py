@@ -10,7 +10,7 @@ from support.kernel_oracle import loaded, random_grids
 from support.planner_strategies import RULES, random_pace
 from support.processes import words_of_python
 
-from planner_service.kernels import queue_dial, queue_wide_buckets
+from planner_service.kernels import queue_dial, queue_levels
 from planner_service.tree.cost_grid import CostGrid
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec
@@ -23,21 +23,21 @@ def test_random_grids_equal_dijkstra(grids: int) -> None:
 
 
 @pytest.mark.parametrize("rules", RULES)
-def test_buckets_and_wide_buckets_give_the_same_costs_to_the_last_bit(rules: dict) -> None:
+def test_buckets_of_one_level_and_of_many_give_the_same_costs_to_the_last_bit(rules: dict) -> None:
     rng = np.random.default_rng(4)
     for ratio in (1.0, 50.0, 2000.0):
         pace = random_pace(rng, 260, 259, ratio, 0.2)
         target = int(np.flatnonzero(np.isfinite(pace))[0])
         ground = loaded(pace, **rules)
         root, width = ground.pad(target), 0.98 * ground.lowest_cell_cost
-        narrow, wide = np.empty(ground.size, np.float32), np.empty(ground.size, np.float32)
+        narrow, leveled = np.empty(ground.size, np.float32), np.empty(ground.size, np.float32)
         scratch = queue_dial.make_scratch(ground.size, ground.rule, 4096)
         state, at_once = np.empty(5, np.int64), (np.array((root,)), queue_dial.WHOLE, queue_dial.NO_AIM)
         assert queue_dial.grow_by_buckets(ground.padded, narrow, (width, 4096), scratch, state, *at_once) > 0
-        room = queue_wide_buckets.make_scratch(ground.size, ground.rule)
-        reach = queue_wide_buckets.grow_by_wide_buckets(ground.padded, wide, root, width, room)
-        np.testing.assert_array_equal(wide, narrow)
-        assert reach >= wide[np.isfinite(wide)].max()
+        room = queue_levels.make_scratch(ground.size)
+        for finest in (width, width / 1000):
+            queue_levels.grow_by_levels(ground.padded, None, leveled, root, finest, True, room)
+            np.testing.assert_array_equal(leveled, narrow)
 
 
 @pytest.mark.parametrize(

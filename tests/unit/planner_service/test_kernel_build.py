@@ -49,7 +49,7 @@ def test_what_is_compiled_is_what_the_grounds_of_a_scenario_take(directional, al
     needed = needed_kernels(given)
     terrain = build_terrain(given)
     climbs = {GROUND: terrain.climb, **{k: v.climb for k, v in class_terrains(given, terrain).items()}}
-    growths = {False: "grow_by_buckets", True: "grow_directed_by_buckets"}
+    growths = {False: "grow_by_levels", True: "grow_by_levels_directed"}
     mends = {False: "mend", True: "mend_directed"}
     pulled = {False: "pull_routes", True: "pull_routes_directed"}
     first, later = set(map(name_of, needed.first)), set(map(name_of, needed.later))

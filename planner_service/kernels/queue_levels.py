@@ -1,10 +1,11 @@
-"""Exact growth where a step also costs by what it climbs, over cell costs of any ratio, with buckets of several
+"""Exact growth over cell costs of any ratio, and where a step also costs by what it climbs, with buckets of several
 levels (E. V. Denardo, B. L. Fox, "Shortest-route methods: 1. Reaching, pruning, and buckets", Operations Research
 27(1), 1979, 161-186).
 
-Neighbours of a cell are offered different keys, so that a cell's first offer is not its least, as it is in
-`queue_dial`. But where no cell of a bucket offers anything that lies in it, all of them are final. So a cell
-waits under its own cost, once for each time that it fell, and is served once. Parents follow from the costs.
+Where a step costs by what it climbs, neighbours of a cell are offered different keys, so that a cell's first offer
+is not its least, as it is in `queue_dial`. But where no cell of a bucket offers anything that lies in it, all of
+them are final. So a cell waits under its own cost, once for each time that it fell, and is served once. Parents
+follow from the costs.
 
 A cost's *index* is how many finest widths it has. A cell waits in the bucket of the
 first digit, to the base 128, in which its index differs from what is served. Buckets of one level are 128 times as
@@ -32,16 +33,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from planner_service.kernels.climbs import CLIMBS, find_entries, is_windy
-from planner_service.kernels.decorators import helper, kernel, prefetch
-from planner_service.kernels.heap_and_buckets import QUEUE, Queue, empty, make_queue, put, take
-from planner_service.kernels.layout import GRID, INF, RULE_FOUR, WALL
+from planner_service.kernels.decorators import helper, prefetch, step_kernel
+from planner_service.kernels.heap_and_buckets import QUEUE, Queue, empty, make_queue, open_costs, put, take
+from planner_service.kernels.layout import GRID, INF, RULE_FOUR, WALL, diagonal_length
 
 _ONE = np.uint64(1)
 _ZERO = np.uint64(0)
 _TWO, _THREE, _FOUR, _FIVE, _SIX, _SEVEN = (np.uint64(n) for n in range(2, 8))
 _WAYS = 4, 2, 6, 0, 3, 5, 1, 7
 """Directions of the steps into a cell from its neighbours, in the order in which these are offered something."""
-_ZERO32 = np.float32(0.0)
+_ZERO32, _ONE32 = np.float32(0.0), np.float32(1.0)
 _AHEAD = 8
 """Cells of a batch between asking for one's memory and using it (docs/design/bucket-queues.md)."""
 _PIECE = np.uint64(1 << 6)
@@ -116,13 +117,10 @@ def _find_rises(height, s, straight_only, batch, first, n, rises):
 
 
 @helper
-def _offer(cell_cost, cost, climbs, s, straight_only, corners, batch, first, n, steps, touched):
-    """Offer the neighbours of `n` cells what a step into them costs. Writes those whose cost has fallen to
-    `touched`; returns how many times."""
-    count = _ZERO
-    height, prices = climbs[0], climbs[1]
+def _find_steps(climbs, s, straight_only, batch, first, n, steps):
+    """Finds the entries of `prices` of the steps into `n` cells of a batch, direction by direction."""
     rises, entries = steps
-    _find_rises(height, s, straight_only, batch, first, n, rises)
+    _find_rises(climbs[0], s, straight_only, batch, first, n, rises)
     find_entries(rises, _ZERO, n * _FOUR, climbs, 0, entries)
     if not straight_only:
         find_entries(rises, n * _FOUR, n * _FOUR, climbs, 1, entries)
@@ -131,6 +129,26 @@ def _offer(cell_cost, cost, climbs, s, straight_only, corners, batch, first, n, 
             shift = climbs[3][_WAYS[k]] - climbs[3][k >> 2]
             for i in range(n):
                 entries[n * np.uint64(k) + i] += shift
+
+
+@helper
+def _price(climbs, entries, at, length):
+    """Cost of a step, in cell costs: its length, or the entry found for it."""
+    if climbs is None:
+        return length
+    return climbs[1][np.uint64(entries[at])]
+
+
+@helper
+def _offer(grid, climbs, cost, batch, first, n, steps, touched):
+    """Offer the neighbours of `n` cells what a step into them costs. Writes those whose cost has fallen to
+    `touched`; returns how many times."""
+    cell_cost, _, stride, rule, corners = grid
+    s, straight_only, slant = np.uint64(stride), rule == RULE_FOUR, diagonal_length(rule)
+    count = _ZERO
+    entries = steps[1]
+    if climbs is not None:
+        _find_steps(climbs, s, straight_only, batch, first, n, steps)
     for i in range(n):
         u = np.uint64(batch[first + i])
         ahead = np.uint64(batch[first + i + np.uint64(_AHEAD)])
@@ -149,7 +167,7 @@ def _offer(cell_cost, cost, climbs, s, straight_only, corners, batch, first, n, 
             (_TWO, u + _ONE, east),
             (_THREE, below, south),
         ):
-            key = base + own * prices[np.uint64(entries[n * k + i])]
+            key = base + own * _price(climbs, entries, n * k + i, _ONE32)
             cost[v] = min(old, key)
             touched[count] = v
             count += np.uint64(key < old)
@@ -162,7 +180,7 @@ def _offer(cell_cost, cost, climbs, s, straight_only, corners, batch, first, n, 
             (_SEVEN, below + _ONE, min(south, east)),
         ):
             old = cost[v]
-            key = base + own * prices[np.uint64(entries[n * k + i])]
+            key = base + own * _price(climbs, entries, n * k + i, slant)
             key = key if corners or shut > WALL else INF
             cost[v] = min(old, key)
             touched[count] = v
@@ -259,16 +277,14 @@ def _put_back(cost, inverse, served, level, batch, n, least, scratch):
 
 
 @helper
-def _serve(grid, cost, climbs, inverse, served, level, n, scratch):
+def _serve(grid, climbs, cost, inverse, served, level, n, scratch):
     """Makes the cells of the batch that have not yet make their offers."""
-    cell_cost, _, stride, rule, corners = grid
     touched, chosen, batch, steps, waiting, queue = scratch
-    s = np.uint64(stride)
     n = _serve_once(cost, batch, n)
     first = _ZERO
     while first < n:
         some = min(_PIECE, n - first)
-        count = _offer(cell_cost, cost, climbs, s, rule == RULE_FOUR, corners, batch, first, some, steps, touched)
+        count = _offer(grid, climbs, cost, batch, first, some, steps, touched)
         _choose_buckets(cost, inverse, served, level, touched, count, waiting, chosen)
         put(queue, touched, count, chosen, _MASK, _ZERO)
         first += some
@@ -282,8 +298,8 @@ def _find_level(waiting):
     return level
 
 
-@kernel(f"({GRID}, f4[::1], i8, {CLIMBS}, f8, b1, {_SCRATCH})")
-def grow_directed_by_buckets(grid, cost, root, climbs, width, may_lead_back, scratch):
+@step_kernel(f"({GRID}, CLIMBS, f4[::1], i8, f8, b1, {_SCRATCH})", CLIMBS)
+def grow_by_levels(grid, climbs, cost, root, width, may_lead_back, scratch):
     """Costs to `root`, a padded, passable cell. `cost` is written whole.
 
     width    s, of the finest buckets. Costs are exact whatever it is
@@ -296,13 +312,12 @@ def grow_directed_by_buckets(grid, cost, root, climbs, width, may_lead_back, scr
     empty(queue, _LEVELS * _BASE)
     head, tail = queue[3], queue[4]
     inverse = np.float32(min(1.0 / width, 1e30))
-    for i in range(cell_cost.size):
-        cost[i] = INF if cell_cost[i] < INF else WALL
+    open_costs(cell_cost, cost)
     for level in range(_LEVELS):
         waiting[level] = _ZERO
     cost[np.uint64(root)] = _ZERO32
     batch[0] = root
-    _serve(grid, cost, climbs, inverse, _ZERO, _ZERO, _ONE, scratch)
+    _serve(grid, climbs, cost, inverse, _ZERO, _ZERO, _ONE, scratch)
     served = _ZERO
     level = _find_level(waiting)
     while level < _LEVELS:
@@ -321,7 +336,7 @@ def grow_directed_by_buckets(grid, cost, root, climbs, width, may_lead_back, scr
                 n = _put_back(cost, inverse, served, level, batch, n, _ALL, scratch)
             elif within > _ZERO:
                 n = _put_back(cost, inverse, served, level, batch, n, least, scratch)
-        _serve(grid, cost, climbs, inverse, served, level, n, scratch)
+        _serve(grid, climbs, cost, inverse, served, level, n, scratch)
         level = _find_level(waiting)
     for i in range(cost.size):
         cost[i] = abs(cost[i])
