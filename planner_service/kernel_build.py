@@ -28,6 +28,7 @@ from planner_service.kernels import (
     cell_costs,
     costs_from_parents,
     heap_and_buckets,
+    lower_bounds,
     parents_from_costs,
     partial_growth_kernels,
     piece_totals,
@@ -59,6 +60,7 @@ FIRST: tuple[Kernel | StepKernel, ...] = (
     StepKernel(queue_dial.begin, None),
     partial_growth_kernels.open_cells,
     route_kernels.drive_rests,
+    lower_bounds.bound_costs,
     cell_costs.changed_cells,
     cell_costs.block_ranges,
 )

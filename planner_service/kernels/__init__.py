@@ -3,7 +3,7 @@
 `layout` says what the arrays are, `decorators` how kernels are compiled and kept, `climbs` what a step's
 rise does to its cost. Trees are grown by the queues, made exact again by `repair`, `costs_from_parents` and
 `tile_*`, and thinned out far from their root by `stride_networks`. `partial_growth_kernels` finds how far a growth
-must go, `route_kernels` and `any_angle_kernels` read a tree.
+must go, `route_kernels`, `any_angle_kernels` and `lower_bounds` read a tree.
 
 Cells leave a queue in the order of their costs. There is one for each kind of search:
 

@@ -20,6 +20,7 @@ from planner_service.kernels.cell_costs import cut_window, find_rim, merge_windo
 from planner_service.kernels.climbs import climbs_in
 from planner_service.kernels.costs_from_parents import Walk, make_walk, mend
 from planner_service.kernels.layout import NONE, Labels, PaddedGrid, step_offsets
+from planner_service.kernels.lower_bounds import WindowBound
 from planner_service.kernels.parents_from_costs import point_to_parents
 from planner_service.kernels.repair import repair
 from planner_service.kernels.route_kernels import point_routes
@@ -32,15 +33,6 @@ from shared_map.array_files import Floats
 from swarm.errors import OutsideGridError
 from swarm.grid import Window
 
-WindowBound = tuple[Floats, tuple[int, int, int, int], Cells, NDArray[np.float64]]
-"""Lower bound of a window around the root on every path that stays inside: (part, box, rim, rim_cost).
-
-part      float32  (cells,)  s; cost of the window's cells as a padded grid of its own; exact inside it
-box       (row0, col0, row1, col1) of the window
-rim       int64    (m,)      padded cells of the window, in the whole grid, from which a step leads out of it; empty
-                             if there is no window
-rim_cost  float64  (m,)      s; the window's own cost of each cell of the rim
-"""
 NO_WINDOW: WindowBound = (np.empty(0, np.float32), (0, 0, 0, 0), np.empty(0, np.int64), np.empty(0, np.float64))
 
 MOST_SPREAD_SHARE = 48

@@ -16,10 +16,11 @@ from numpy.typing import NDArray
 
 from planner_service.kernels import piece_totals, tile_pieces, tile_search
 from planner_service.kernels.layout import NONE, PaddedGrid
+from planner_service.kernels.lower_bounds import WindowBound
 from planner_service.kernels.tile_pieces import Tree
 from planner_service.tree.cost_changes import Cells, Changes
 from planner_service.tree.cost_grid import NO_COSTS, CostGrid
-from planner_service.tree.cost_to_go import CostToGoTree, WindowBound, grow_window
+from planner_service.tree.cost_to_go import CostToGoTree, grow_window
 from planner_service.tree.queue_choice import KeptScratch
 from shared_map.array_files import Floats
 from swarm.grid import Window

@@ -1,21 +1,16 @@
-"""Proven lower bounds on the time to the target: docs/method/certificates.md says why they hold.
-
-An earlier root's exact costs are a consistent heuristic: the landmark bound of ALT (A. V. Goldberg, C. Harrelson,
-"Computing the shortest path: A* search meets graph theory", SODA 2005) with one landmark. No path from a cell to
-the root costs less than the heuristic falls between the two. A window around the root adds that a way either stays
-inside, or comes in over the window's rim for the last time.
-"""
+"""Proven lower bounds on the time to the target: docs/method/certificates.md says why they hold."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
+from planner_service.kernels import lower_bounds as kernels
 from planner_service.kernels.repair import repair
 from planner_service.kernels.route_kernels import OK
 from planner_service.tree.cost_changes import Changes
-from planner_service.tree.cost_grid import CostGrid
-from planner_service.tree.cost_to_go import NO_WINDOW, CostToGoTree, WindowBound
+from planner_service.tree.cost_grid import NO_COSTS, CostGrid
+from planner_service.tree.cost_to_go import NO_WINDOW, CostToGoTree
 from planner_service.tree.partitioned_tree import PartitionedTree
 from shared_map.array_files import Floats
 from swarm.wire.route_columns import RouteBatch
@@ -68,44 +63,20 @@ class LowerBounds:
               is proven
         Raises ValueError where a start is no padded cell.
         """
+        grid = self._grid
         cost = tree.cost_at(starts) if cost is None else cost
-        found = cost < np.inf
-        known_s = np.where(found, cost, 0.0)
-        rounding = self._grid.rounding.at(known_s)
-        if tree.exact:
-            own, by_rounding = tree.slack
-            bound = known_s - known_s * np.minimum(own + by_rounding * rounding, 1.0)
-        else:
-            bound = self._beside(tree.window_bound or NO_WINDOW, self._grid.pad(tree.root), starts, rounding)
-        # Of the optimum only the share that is travel time counts.
-        return np.where(found, bound, 0.0) * self._grid.time_share
-
-    def _beside(
-        self, window: WindowBound, root: int, starts: NDArray[np.int64], rounding: NDArray[np.float64]
-    ) -> NDArray[np.float64]:
-        """The larger of what the heuristic and the window around the padded root prove.
-
-        rounding  relative, of a cost at each start
-        """
-        part, (row0, col0, row1, col1), rim, rim_cost = window
-        inner = rim_cost * (1.0 - self._grid.rounding.at(rim_cost.max(initial=0.0)))
-        way = np.full(starts.size, inner.min(initial=np.inf))
-        fall = np.zeros(starts.size)
-        if (heuristic := self._heuristic) is not None:
-            own = heuristic[starts].astype(np.float64)
-            own = np.where(own < np.inf, own, 0.0) * (1.0 - rounding)
-            fall = np.maximum(own - float(heuristic[root]), 0.0)
-            if rim.size:
-                way = np.maximum(way, own - (heuristic[rim] - inner).max())
-        rows, cols = np.divmod(starts, self._grid.stride)
-        inside = np.flatnonzero((rows > row0) & (rows <= row1) & (cols > col0) & (cols <= col1))
-        within = part[(rows[inside] - row0) * (col1 - col0 + 2) + cols[inside] - col0].astype(np.float64)
-        inside, within = inside[within < np.inf], within[within < np.inf]
-        way[inside] = np.minimum(way[inside], within * (1.0 - rounding[inside]))
-        # A route was found, so that no bound is infinite; a rim that leads nowhere would be.
-        return np.maximum(fall, np.where(way < np.inf, way, 0.0))
+        heuristic = NO_COSTS if self._heuristic is None else self._heuristic
+        bound = np.empty(starts.size)
+        kernels.bound_costs(
+            *(cost, starts, grid.rounding.cheapest, tree.slack if tree.exact else _NOT_EXACT),
+            *((heuristic, grid.pad(tree.root), grid.stride), tree.window_bound or NO_WINDOW),
+            *(grid.time_share, bound),  # of the optimum only the share that is travel time counts
+        )
+        return bound
 
 
+_NOT_EXACT = (-1.0, 0.0)
+"""In place of a tree's slack, which is 0 or more."""
 _NO_PARENTS: NDArray[np.uint8] = np.empty(0, np.uint8)
 
 
