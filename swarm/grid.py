@@ -11,10 +11,10 @@ import operator
 import reprlib
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import lru_cache
 from itertools import accumulate
-from typing import Any
+from typing import Any, TypeVar
 
 from swarm.errors import ArgumentError, OutsideGridError
 
@@ -123,14 +123,19 @@ def is_of_earth(radius_m: float) -> bool:
     return abs(radius_m / 6_371_000 - 1) < 0.01
 
 
+Cells = TypeVar("Cells", bound=Any)
+"""A cell, or an array of cells."""
+
+
 @dataclass(frozen=True, slots=True)
 class GridSpec:
-    """Shape and place of the terrain.
+    """Shape and place of the terrain, or of the finer grid of right of way on it (`traffic`).
 
     rows, cols       cells from north to south and from west to east, 1 or more
     resolution_m     side of a cell, above 0
     west_m, north_m  outer corner of cell (0, 0) in the frame of `crs`
     crs              coordinate system, such as "EPSG:32632"; "local" is metres from anywhere
+    parts            cells across a cell of the terrain, an odd number; 1 of the terrain itself
 
     Raises ArgumentError on a shape or resolution that no grid has, and on what is no number. A cell is whole
     numbers: half a row would be half the map's width away.
@@ -142,6 +147,7 @@ class GridSpec:
     west_m: float = 0.0
     north_m: float = 0.0
     crs: str = "local"
+    parts: int = 1
 
     def __post_init__(self) -> None:
         if whole("rows", self.rows) < 1 or whole("cols", self.cols) < 1:
@@ -185,6 +191,49 @@ class GridSpec:
     @property
     def regions(self) -> int:
         return -(-self.tile_rows // REGION_TILES) * self.region_cols
+
+    # --- cells of right of way and cells of the terrain -------------------------------------------------------
+
+    def traffic(self, parts: int) -> GridSpec:
+        """The cells of right of way: each cell of this terrain has `parts` x `parts` of them, and one of them is in
+        its middle, as `parts` is odd. Raises ArgumentError if they are too many."""
+        side_m = self.resolution_m / parts
+        rows, cols = self.rows * parts, self.cols * parts
+        return replace(self, rows=rows, cols=cols, resolution_m=side_m, parts=parts)
+
+    def terrain_cell(self, cell: Cells) -> Cells:
+        """The cell of the terrain that holds a cell, or those that hold an array of cells."""
+        parts, cols = self.parts, self.cols
+        if parts == 1:
+            return cell
+        found: Cells = cell // cols // parts * (cols // parts) + cell % cols // parts
+        return found
+
+    def middle(self, terrain_cell: int) -> int:
+        """The cell in the middle of a cell of the terrain."""
+        row, col = divmod(terrain_cell, self.cols // self.parts)
+        half = self.parts // 2
+        return (row * self.parts + half) * self.cols + col * self.parts + half
+
+    def terrain_step(self, tail: int, head: int) -> tuple[int, int]:
+        """The step between middles of neighbours in the terrain of which a step to a neighbour is a part. Both are
+        one cell where that step leads over the border of the terrain."""
+        parts, half, cols = self.parts, self.parts // 2, self.cols // self.parts
+        begin, end = [], []
+        for at, to in zip(divmod(tail, self.cols), divmod(head, self.cols), strict=True):
+            low = (min(at, to) - half) // parts
+            begin.append(at // parts if at == to else low + (at > to))
+            end.append(at // parts if at == to else low + (at < to))
+        rows, columns = zip(begin, end, strict=True)
+        if min(*rows, *columns) < 0 or max(rows) >= self.rows // parts or max(columns) >= cols:
+            return (self.terrain_cell(head),) * 2
+        return begin[0] * cols + begin[1], end[0] * cols + end[1]
+
+    def finer(self, window: Window) -> Window:
+        """The cells in a window of the terrain."""
+        return Window(*(self.parts * side for side in (window.row0, window.col0, window.row1, window.col1)))
+
+    # --- cells ------------------------------------------------------------------------------------------------
 
     def inside(self, row: int, col: int) -> bool:
         return 0 <= row < self.rows and 0 <= col < self.cols
@@ -311,3 +360,32 @@ def walk(grid: GridSpec, start: int, directions: bytes) -> list[int]:
             grid.cell(row, col)  # raises
         cells.append(row * cols + col)
     return cells
+
+
+def crossed(grid: GridSpec, start: int, end: int) -> list[int]:
+    """The cells which the straight line from the middle of a cell to that of another crosses, both included. Where
+    it passes a corner, the next cell is the diagonal neighbour."""
+    (row, col), (to_row, to_col) = grid.row_col(start), grid.row_col(end)
+    south, east = abs(to_row - row), abs(to_col - col)
+    row_step, col_step = (1 if to_row > row else -1), (1 if to_col > col else -1)
+    cells, rows, cols = [start], 0, 0
+    while cells[-1] != end:
+        ahead = (2 * rows + 1) * east - (2 * cols + 1) * south  # which border it passes first
+        rows += ahead <= 0
+        cols += ahead >= 0
+        cells.append((row + rows * row_step) * grid.cols + col + cols * col_step)
+    return cells
+
+
+def refined(traffic: GridSpec, cells: Sequence[int], turns: Sequence[int] = ()) -> tuple[list[int], list[int]]:
+    """Returns the cells of right of way of a route over cells of the terrain, and the indices of the turns in them.
+
+    turns  of an any-angle route: indices of the cells in which it turns, first and last included
+    """
+    if traffic.parts == 1:
+        return list(cells), list(turns)
+    fine, ends = [traffic.middle(cells[0])], [0]
+    for head in turns[1:] or range(1, len(cells)):
+        fine += crossed(traffic, fine[-1], traffic.middle(cells[head]))[1:]
+        ends.append(len(fine) - 1)
+    return fine, ends if turns else []

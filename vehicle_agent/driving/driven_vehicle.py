@@ -6,7 +6,7 @@ from __future__ import annotations
 import enum
 from bisect import bisect_left
 from collections.abc import Callable, Iterable, Sequence
-from itertools import pairwise
+from itertools import accumulate, groupby, pairwise
 
 import msgspec
 import numpy as np
@@ -167,7 +167,7 @@ _LONGEST_RETRY_NS = 3 * NS_PER_S
 STRANDED_RETRY_NS = 3 * NS_PER_S
 """Vehicles without a path ask again so soon: only a changed map gives them one."""
 PREFETCH_CELLS = 8
-"""The next part of a partial route is requested when so few cells are left."""
+"""The next part of a partial route is requested when so few cells of the terrain are left."""
 
 
 PLACES = "place:"
@@ -210,7 +210,7 @@ class Reason(enum.Enum):
 class GivenRoute(msgspec.Struct, frozen=True):
     """A route from a planner, requested or pushed.
 
-    cells          from the cell in which the planner assumed the vehicle
+    cells          of right of way, from the cell in which the planner assumed the vehicle
     cost_s         its cost, in seconds
     lower_bound_s  proven lower bound of the cost of any route
     partial        whether it ends before the target
@@ -235,7 +235,7 @@ class Vehicle:
     """State of one vehicle. Its agent drives it along `route` through `motion`, and tells it what happens.
 
     target        the target, or the name of the place, that it goes for; None before the first assignment
-    goal          the cell of that place; None of a target
+    goal          the terrain's cell of that place; None of a target
     in_reach      whether that target is within capture range
     tracked       whether that target has a living tracker; if not, `in_reach` refers to its last pose
     planner_gone  whether that target's planner is dead, since `gone_since_ns`
@@ -247,7 +247,8 @@ class Vehicle:
 
     def __init__(self, id: str, grid: GridSpec, cell: int) -> None:
         self.id = id
-        self._cols = grid.cols
+        self._grid = grid
+        self._prefetch_cells = PREFETCH_CELLS * grid.parts
         self.state = VehicleState.IDLE
         self.target: str | None = None
         self.goal: int | None = None
@@ -269,6 +270,11 @@ class Vehicle:
     @property
     def cell(self) -> int:
         return self.motion.cell
+
+    @property
+    def terrain_cell(self) -> int:
+        """The cell of the terrain in which it is."""
+        return self._grid.terrain_cell(self.motion.cell)
 
     # --- targets and planners -------------------------------------------------------------------------------
 
@@ -344,7 +350,7 @@ class Vehicle:
                 elif self.route.partial:
                     self._need = Reason.CONTINUED
                 self._settle()  # of all that the state follows from, only this changes by driving
-            elif left <= PREFETCH_CELLS and self.route.partial:
+            elif left <= self._prefetch_cells and self.route.partial:
                 self._need = Reason.CONTINUED
         if self._need is None or self.asked is not None or now_ns < self._ask_due_ns:
             return None
@@ -357,7 +363,7 @@ class Vehicle:
         """True if the vehicle chases a target and has more than `PREFETCH_CELLS` cells of route left:
         `route_request` then returns None, and need not be called."""
         goes = self.target is not None and self.goal is None and not self.in_reach and self._need is None
-        return goes and self.state is not VehicleState.STRANDED and self.route.left > PREFETCH_CELLS
+        return goes and self.state is not VehicleState.STRANDED and self.route.left > self._prefetch_cells
 
     def give_route(self, given: GivenRoute, path: Sequence[int], now_ns: int) -> Followed | None:
         """Begins the route, if it leads to the target and passes a cell of the vehicle's path. Returns what to tell
@@ -421,14 +427,16 @@ class Vehicle:
             self.state = VehicleState.FOLLOWING
         (start,) = self.route.near(1)
         before = path[: path.index(start)]
-        driven = (*before, start, *self.route.ahead())
+        cells = list(map(self._grid.terrain_cell, (*before, start, *self.route.ahead())))
+        steps = list(accumulate((tail != head for tail, head in pairwise(cells)), initial=0))
         legs = self.route.legs_ahead()
-        legs = [1] * (len(before) * bool(legs)) + legs
+        ends = list(accumulate([1] * (len(before) * bool(legs)) + legs, initial=0))
+        legs = [steps[end] - steps[begin] for begin, end in pairwise(ends) if steps[end] > steps[begin]]
         return Followed(
             vehicle=self.id,
             target=given.target if self.goal is None else _PLACE,
-            start=driven[0],
-            directions=directions_of(driven, self._cols),
+            start=cells[0],
+            directions=directions_of([cell for cell, _ in groupby(cells)], self._grid.cols // self._grid.parts),
             cost_s=given.cost_s,
             lower_bound_s=given.lower_bound_s,
             legs=pack_column(legs, "<u4"),
@@ -465,8 +473,8 @@ class Places:
     """Vehicles and their places at one instant, in one order.
 
     vehicles     in the order of all arrays
-    cells        int64 (n,), flat indices
-    regions      int64 (n,)
+    cells        int64 (n,), flat indices of cells of right of way
+    regions      int64 (n,), of the terrain
     east_m       float64 (n,), from the grid's west border
     south_m      float64 (n,), from its north border
     heading_rad  float64 (n,), clockwise from north
@@ -478,5 +486,5 @@ class Places:
         self.east_m, self.south_m = places_m(rows, grid)
         self.heading_rad: NDArray[np.float64] = rows[:, HEADING_RAD]
         self.cells: NDArray[np.int64] = rows[:, CELL].astype(np.int64)
-        row, col = np.divmod(self.cells, grid.cols)
-        self.regions: NDArray[np.int64] = row // REGION_CELLS * grid.region_cols + col // REGION_CELLS
+        (row, col), side = np.divmod(self.cells, grid.cols), REGION_CELLS * grid.parts
+        self.regions: NDArray[np.int64] = row // side * -(-grid.cols // side) + col // side
