@@ -11,7 +11,7 @@ import operator
 import reprlib
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
 from itertools import accumulate
 from typing import Any, TypeVar
@@ -147,7 +147,7 @@ class GridSpec:
     west_m: float = 0.0
     north_m: float = 0.0
     crs: str = "local"
-    parts: int = 1
+    parts: int = field(default=1, repr=False)  # digests of terrains are made of what is shown
 
     def __post_init__(self) -> None:
         if whole("rows", self.rows) < 1 or whole("cols", self.cols) < 1:
@@ -389,3 +389,24 @@ def refined(traffic: GridSpec, cells: Sequence[int], turns: Sequence[int] = ()) 
         fine += crossed(traffic, fine[-1], traffic.middle(cells[head]))[1:]
         ends.append(len(fine) - 1)
     return fine, ends if turns else []
+
+
+def joined(
+    grid: GridSpec, cells: Sequence[int], turns: Sequence[int], path: Sequence[int]
+) -> tuple[list[int], list[int]]:
+    """Returns the cells of right of way of a route over the terrain, and the indices of its turns, as of `refined`.
+
+    path  of the vehicle. If the route passes none of its cells, but a cell of the terrain with one of them, it
+          begins there and leads straight to where it leaves that cell of the terrain.
+    """
+    fine, turns = refined(grid, cells, turns)
+    if set(path).isdisjoint(fine):
+        ground = list(map(grid.terrain_cell, fine))
+        for cell in reversed(path):
+            if (at := grid.terrain_cell(cell)) in ground:
+                leaves = len(ground) - 1 - ground[::-1].index(at)
+                way = crossed(grid, cell, fine[leaves])
+                more = len(way) - 1 - leaves
+                turns = turns and [*range(len(way)), *(turn + more for turn in turns if turn > leaves)]
+                return [*way, *fine[leaves + 1 :]], turns
+    return fine, turns

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from shared_map.terrain.slope_and_climb import may_be_pulled
 from swarm.clock import NS_PER_S
 from swarm.config.scenario import AgentPlan, Scenario
-from swarm.grid import GridSpec, Window, crossed, refined, walk
+from swarm.grid import Window, joined, walk
 from swarm.right_of_way.holdings import CellRequest, Holdings
 from swarm.runtime.tracker_ownership import Trackings
 from swarm.wire.messages.orders import GoalState
@@ -59,27 +59,6 @@ class AskRoutes:
 
 
 AgentAction = AskRoutes | AskCosts
-
-
-def joined(
-    grid: GridSpec, cells: Sequence[int], turns: Sequence[int], path: Sequence[int]
-) -> tuple[list[int], list[int]]:
-    """Returns the cells of right of way of a route over the terrain, and the indices of its turns, as of `refined`.
-
-    path  of the vehicle. If the route passes none of its cells, but a cell of the terrain with one of them, it
-          begins there and leads straight to where it leaves that cell of the terrain.
-    """
-    fine, turns = refined(grid, cells, turns)
-    if set(path).isdisjoint(fine):
-        ground = list(map(grid.terrain_cell, fine))
-        for cell in reversed(path):
-            if (at := grid.terrain_cell(cell)) in ground:
-                leaves = len(ground) - 1 - ground[::-1].index(at)
-                way = crossed(grid, cell, fine[leaves])
-                more = len(way) - 1 - leaves
-                turns = turns and [*range(len(way)), *(turn + more for turn in turns if turn > leaves)]
-                return [*way, *fine[leaves + 1 :]], turns
-    return fine, turns
 
 
 class Agent:

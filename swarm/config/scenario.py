@@ -406,7 +406,7 @@ def traffic_grid(scenario: Scenario, terrain: GridSpec) -> GridSpec:
         return terrain
     cell_m = terrain.resolution_m
     parts = round(cell_m / side_m)
-    if parts % 2 == 0 or not math.isclose(parts * side_m, cell_m, rel_tol=_ROUNDED):
+    if parts % 2 == 0 or parts > MOST_SHARD_REGIONS or not math.isclose(parts * side_m, cell_m, rel_tol=_ROUNDED):
         some = ", ".join(f"{cell_m / odd:.6g}" for odd in (1, 3, 5, 7))
         raise ConfigError(
             f"map.traffic_cell_m is {side_m:g}, expected the terrain's cell of {cell_m:g} m divided by an odd"

@@ -115,7 +115,7 @@ class RightOfWay:
         if request.agent == self.agent or self.silent or self._is_external:
             return []
         if request.agent not in self.spawns or not request.disk:
-            if not self._has_quorum:
+            if not self._has_quorum or request.shard_cells != REGION_CELLS * self.shards.grid.parts:
                 return []
             known = self._known_of(request.agent, request.disk)
             return [

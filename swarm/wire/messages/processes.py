@@ -7,11 +7,11 @@ from typing import Annotated
 import msgspec
 from msgspec import Meta
 
-from swarm.grid import REGION_CELLS
+from swarm.grid import MOST_SHARD_REGIONS, REGION_CELLS
 from swarm.wire import fields
 from swarm.wire.messages import Message, schema_of
 
-TrafficParts = Annotated[int, Meta(ge=1, le=1 << 14)]
+TrafficParts = Annotated[int, Meta(ge=1, le=MOST_SHARD_REGIONS)]
 """Cells of right of way across a cell of the terrain."""
 
 
