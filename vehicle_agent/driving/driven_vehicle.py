@@ -4,6 +4,7 @@ drives it."""
 from __future__ import annotations
 
 import enum
+from array import array
 from bisect import bisect_left
 from collections.abc import Callable, Iterable, Sequence
 from itertools import accumulate, groupby, pairwise
@@ -37,7 +38,8 @@ class Follower:
     """
 
     def __init__(self) -> None:
-        self._cells: list[int] = []
+        self._cells = array("q")
+        """Not a list: a thousand routes of ten thousand cells would take a third of a GB."""
         self._at = 0
         self._turns: Sequence[int] = ()
         """For an any-angle route the indices of the cells in which it turns, its first and last included; and
@@ -59,17 +61,17 @@ class Follower:
         at = next((cells.index(cell) for cell in path if cell in cells), None)
         if at is None:
             return False
-        self._set(list(cells), at)
+        self._set(array("q", cells), at)
         self.partial = partial
         self._turns, self._turn_cells = turns, [cells[turn] for turn in turns]
         return True
 
     def drop(self) -> None:
-        self._set([], 0)
+        self._set(array("q"), 0)
         self._turns = self._turn_cells = ()
         self.partial = False
 
-    def _set(self, cells: list[int], at: int) -> None:
+    def _set(self, cells: array[int], at: int) -> None:
         self._cells, self._at, self._bounds = cells, at, None
         self.left = max(len(cells) - at - 1, 0)
         self.changes += 1
@@ -93,7 +95,7 @@ class Follower:
     def after(self, cell: int, count: int) -> list[int]:
         """The next `count` cells after a cell of the route; none if the cell is not on it."""
         index = self._find(cell)
-        return [] if index is None else self._cells[index + 1 : index + 1 + max(count, 0)]
+        return [] if index is None else self._cells[index + 1 : index + 1 + max(count, 0)].tolist()
 
     def _find(self, cell: int) -> int | None:
         """Returns the index on the route of a cell that the vehicle may enter next; None if the cell is not such a
@@ -140,12 +142,13 @@ class Follower:
 
     def near(self, count: int) -> list[int]:
         """The cell of the route that the vehicle passed last, and the next ones."""
-        return self._cells[self._at : self._at + count]
+        return self._cells[self._at : self._at + count].tolist()
 
     def ahead(self, count: int | None = None) -> list[int]:
         """The next `count` cells, or all that are left, without the one on which the vehicle is."""
         first = self._at + 1
-        return self._cells[first:] if count is None else self._cells[first : first + count]
+        last = len(self._cells) if count is None else first + count
+        return self._cells[first:last].tolist()
 
     def cut(self, passable: Callable[[Sequence[int]], int]) -> bool:
         """Ends the route before the first step ahead that is not passable; True if there is one.
