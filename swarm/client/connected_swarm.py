@@ -451,6 +451,6 @@ def agreed(answers: Sequence[tuple[RunInfo, int]], where: str) -> tuple[RunInfo,
     return of_run[0][0], ahead_ns[len(ahead_ns) // 2] if ahead_ns else 0
 
 
-def _grid_of(info: RunInfo) -> tuple[object, ...]:
-    shape = info.rows, info.cols, info.resolution_m, info.traffic_parts
-    return info.run_id, *shape, info.west_m, info.north_m, info.crs
+def _grid_of(info: RunInfo) -> tuple[str, int, int, float, float, float, str, int]:
+    parts = info.traffic_parts or 1
+    return info.run_id, info.rows, info.cols, info.resolution_m, info.west_m, info.north_m, info.crs, parts

@@ -230,7 +230,8 @@ class Vehicle(Reported):
     def _reported(self) -> Obstacle:
         if self._word is None:
             raise ConfigError(f"vehicle {self.id} has not said where it is: call at() first")
-        return self._word
+        word: Obstacle = self._word
+        return word
 
     # --- right of way -------------------------------------------------------------------------------------------
 
@@ -266,9 +267,11 @@ class Vehicle(Reported):
         return self._has_way().may_enter(checked_cell(self._session.frame.traffic, cell), wait_s)
 
     def cells_of(self, route: Route) -> list[int]:
-        """Returns the cells of right of way of a route, from where the vehicle is. Without `map.traffic_cell_m` in
-        the scenario they are those of the route."""
-        return joined(self._session.frame.traffic, route.cells, (), [self.traffic_cell])[0]
+        """Returns the cells of right of way of a route, from where the vehicle is if the route passes its cell.
+        Without `map.traffic_cell_m` in the scenario they are those of the route."""
+        here, cells = self.traffic_cell, route.cells
+        way, _ = joined(self._session.frame.traffic, cells, (), [here]) if cells else ([], [])
+        return way[way.index(here) :] if here in way else way
 
     def _counted(self, way: ExternalSession) -> int:
         """The cell of right of way in which it counts at its last reported position."""

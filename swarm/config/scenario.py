@@ -214,8 +214,9 @@ class MapConfig(Section, frozen=True, kw_only=True):
     shard_regions       side of a shard of right of way, in regions of 256 x 256 cells. Agents send messages about
                         each shard at each tick: few agents on a large map need larger shards. Equal for all
                         processes of a run
-    traffic_cell_m      side of a cell of right of way: that of the terrain's cell, divided by an odd number.
-                        A vehicle occupies one such cell. Default: the terrain's cell
+    traffic_cell_m      side of a cell of right of way, of which a vehicle occupies one: the side of the terrain's
+                        cell, which is the default, divided by an odd number. Smaller cells let more vehicles onto a
+                        road, and need more messages. Equal for all processes of a run
     digest_s            interval at which each replica publishes which sets it holds
     author_marks_per_s  a process above this for ten seconds raises an alarm, and its sets are delayed
     total_marks_per_s   the same for all processes together: the sets of those above an equal share are delayed

@@ -110,7 +110,7 @@ class Walker:
 
 
 class Interplay:
-    """One seed, with so many cells of right of way across a cell of the terrain. `broken` is what did not hold."""
+    """One seed, with `parts` cells of right of way across a cell of the terrain. `broken` is what did not hold."""
 
     def __init__(self, seed: int, parts: int, seconds: float = 27.0) -> None:
         self.seed, self.seconds = seed, seconds

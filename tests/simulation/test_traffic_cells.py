@@ -18,7 +18,7 @@ SECONDS = 20.0
 
 
 def in_parts(scenario: Scenario, terrain: Terrain, parts: int) -> Scenario:
-    """The scenario with so many cells of right of way across a cell of its terrain."""
+    """The scenario with `parts` cells of right of way across a cell of its terrain."""
     side_m = terrain.grid.resolution_m / parts
     return replace(scenario, map=replace(scenario.map, traffic_cell_m=side_m))
 

@@ -28,7 +28,8 @@ class RunInfo(Message, frozen=True, kw_only=True, tag=schema_of("run")):
     restarts         in this run
     classes          of vehicles beside "ground", in the order of their numbers
     shard_cells      side of a shard: two layouts in one run would grant a cell twice
-    traffic_parts    cells of right of way across a cell of the grid, 1 if it is not there
+    traffic_parts    cells of right of way across a cell of the grid, 1 if absent. The cells in messages about right
+                     of way, and in `Fleet`, are numbered in the finer grid
     """
 
     run_id: fields.Word
