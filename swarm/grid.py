@@ -11,7 +11,7 @@ import operator
 import reprlib
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from itertools import accumulate
 from typing import Any, TypeVar
@@ -129,13 +129,12 @@ Cells = TypeVar("Cells", bound=Any)
 
 @dataclass(frozen=True, slots=True)
 class GridSpec:
-    """Shape and place of the terrain, or of the finer grid of right of way on it (`traffic`).
+    """Shape and place of the terrain.
 
     rows, cols       cells from north to south and from west to east, 1 or more
     resolution_m     side of a cell, above 0
     west_m, north_m  outer corner of cell (0, 0) in the frame of `crs`
     crs              coordinate system, such as "EPSG:32632"; "local" is metres from anywhere
-    parts            cells across a cell of the terrain, an odd number; 1 of the terrain itself
 
     Raises ArgumentError on a shape or resolution that no grid has, and on what is no number. A cell is whole
     numbers: half a row would be half the map's width away.
@@ -147,7 +146,6 @@ class GridSpec:
     west_m: float = 0.0
     north_m: float = 0.0
     crs: str = "local"
-    parts: int = field(default=1, repr=False)  # digests of terrains are made of what is shown
 
     def __post_init__(self) -> None:
         if whole("rows", self.rows) < 1 or whole("cols", self.cols) < 1:
@@ -194,12 +192,18 @@ class GridSpec:
 
     # --- cells of right of way and cells of the terrain -------------------------------------------------------
 
+    @property
+    def parts(self) -> int:
+        """Cells across a cell of the terrain."""
+        return 1
+
     def traffic(self, parts: int) -> GridSpec:
         """The cells of right of way: each cell of this terrain has `parts` x `parts` of them, and one of them is in
         its middle, as `parts` is odd. Raises ArgumentError if they are too many."""
-        side_m = self.resolution_m / parts
-        rows, cols = self.rows * parts, self.cols * parts
-        return replace(self, rows=rows, cols=cols, resolution_m=side_m, parts=parts)
+        if parts == 1:
+            return self
+        shape, side_m = (self.rows * parts, self.cols * parts), self.resolution_m / parts
+        return TrafficGrid(*shape, side_m, self.west_m, self.north_m, self.crs, parts)
 
     def terrain_cell(self, cell: Cells) -> Cells:
         """The cell of the terrain that holds a cell, or those that hold an array of cells."""
@@ -323,6 +327,16 @@ class GridSpec:
         row_a, col_a = self.row_col(a)
         row_b, col_b = self.row_col(b)
         return max(abs(row_a - row_b), abs(col_a - col_b))
+
+
+@dataclass(frozen=True, slots=True)
+class TrafficGrid(GridSpec):
+    """Cells of right of way that are smaller than those of the terrain. Made by `GridSpec.traffic`.
+
+    parts  cells across a cell of the terrain, an odd number
+    """
+
+    parts: int = 1
 
 
 _CODES = bytes(range(8))
