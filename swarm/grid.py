@@ -14,7 +14,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import lru_cache
 from itertools import accumulate
-from typing import Any
+from typing import Any, TypeVar
 
 from swarm.errors import ArgumentError, OutsideGridError
 
@@ -123,6 +123,10 @@ def is_of_earth(radius_m: float) -> bool:
     return abs(radius_m / 6_371_000 - 1) < 0.01
 
 
+Cells = TypeVar("Cells", bound=Any)
+"""A cell, or an array of cells."""
+
+
 @dataclass(frozen=True, slots=True)
 class GridSpec:
     """Shape and place of the terrain.
@@ -185,6 +189,55 @@ class GridSpec:
     @property
     def regions(self) -> int:
         return -(-self.tile_rows // REGION_TILES) * self.region_cols
+
+    # --- cells of right of way and cells of the terrain -------------------------------------------------------
+
+    @property
+    def parts(self) -> int:
+        """Cells across a cell of the terrain."""
+        return 1
+
+    def traffic(self, parts: int) -> GridSpec:
+        """The cells of right of way: each cell of this terrain has `parts` x `parts` of them, and one of them is in
+        its middle, as `parts` is odd. Raises ArgumentError if they are too many."""
+        if parts == 1:
+            return self
+        shape, side_m = (self.rows * parts, self.cols * parts), self.resolution_m / parts
+        return TrafficGrid(*shape, side_m, self.west_m, self.north_m, self.crs, parts)
+
+    def terrain_cell(self, cell: Cells) -> Cells:
+        """The cell of the terrain that holds a cell, or those that hold an array of cells."""
+        parts, cols = self.parts, self.cols
+        if parts == 1:
+            return cell
+        found: Cells = cell // cols // parts * (cols // parts) + cell % cols // parts
+        return found
+
+    def middle(self, terrain_cell: int) -> int:
+        """The cell in the middle of a cell of the terrain."""
+        row, col = divmod(terrain_cell, self.cols // self.parts)
+        half = self.parts // 2
+        return (row * self.parts + half) * self.cols + col * self.parts + half
+
+    def terrain_step(self, tail: int, head: int) -> tuple[int, int]:
+        """The step between middles of neighbours in the terrain of which a step to a neighbour is a part. Both are
+        one cell where that step leads over the border of the terrain."""
+        parts, half, cols = self.parts, self.parts // 2, self.cols // self.parts
+        begin, end = [], []
+        for at, to in zip(divmod(tail, self.cols), divmod(head, self.cols), strict=True):
+            low = (min(at, to) - half) // parts
+            begin.append(at // parts if at == to else low + (at > to))
+            end.append(at // parts if at == to else low + (at < to))
+        rows, columns = zip(begin, end, strict=True)
+        if min(*rows, *columns) < 0 or max(rows) >= self.rows // parts or max(columns) >= cols:
+            return (self.terrain_cell(head),) * 2
+        return begin[0] * cols + begin[1], end[0] * cols + end[1]
+
+    def finer(self, window: Window) -> Window:
+        """The cells in a window of the terrain."""
+        return Window(*(self.parts * side for side in (window.row0, window.col0, window.row1, window.col1)))
+
+    # --- cells ------------------------------------------------------------------------------------------------
 
     def inside(self, row: int, col: int) -> bool:
         return 0 <= row < self.rows and 0 <= col < self.cols
@@ -276,6 +329,16 @@ class GridSpec:
         return max(abs(row_a - row_b), abs(col_a - col_b))
 
 
+@dataclass(frozen=True, slots=True)
+class TrafficGrid(GridSpec):
+    """Cells of right of way that are smaller than those of the terrain. Made by `GridSpec.traffic`.
+
+    parts  cells across a cell of the terrain, an odd number
+    """
+
+    parts: int = 1
+
+
 _CODES = bytes(range(8))
 """All direction codes: any other byte of a route is invalid."""
 
@@ -311,3 +374,53 @@ def walk(grid: GridSpec, start: int, directions: bytes) -> list[int]:
             grid.cell(row, col)  # raises
         cells.append(row * cols + col)
     return cells
+
+
+def crossed(grid: GridSpec, start: int, end: int) -> list[int]:
+    """The cells which the straight line from the middle of a cell to that of another crosses, both included. Where
+    it passes a corner, the next cell is the diagonal neighbour."""
+    (row, col), (to_row, to_col) = grid.row_col(start), grid.row_col(end)
+    south, east = abs(to_row - row), abs(to_col - col)
+    row_step, col_step = (1 if to_row > row else -1), (1 if to_col > col else -1)
+    cells, rows, cols = [start], 0, 0
+    while cells[-1] != end:
+        ahead = (2 * rows + 1) * east - (2 * cols + 1) * south  # which border it passes first
+        rows += ahead <= 0
+        cols += ahead >= 0
+        cells.append((row + rows * row_step) * grid.cols + col + cols * col_step)
+    return cells
+
+
+def refined(traffic: GridSpec, cells: Sequence[int], turns: Sequence[int] = ()) -> tuple[list[int], list[int]]:
+    """Returns the cells of right of way of a route over cells of the terrain, and the indices of the turns in them.
+
+    turns  of an any-angle route: indices of the cells in which it turns, first and last included
+    """
+    if traffic.parts == 1:
+        return list(cells), list(turns)
+    fine, ends = [traffic.middle(cells[0])], [0]
+    for head in turns[1:] or range(1, len(cells)):
+        fine += crossed(traffic, fine[-1], traffic.middle(cells[head]))[1:]
+        ends.append(len(fine) - 1)
+    return fine, ends if turns else []
+
+
+def joined(
+    grid: GridSpec, cells: Sequence[int], turns: Sequence[int], path: Sequence[int]
+) -> tuple[list[int], list[int]]:
+    """Returns the cells of right of way of a route over the terrain, and the indices of its turns, as of `refined`.
+
+    path  of the vehicle. If the route passes none of its cells, but a cell of the terrain with one of them, it
+          begins there and leads straight to where it leaves that cell of the terrain.
+    """
+    fine, turns = refined(grid, cells, turns)
+    if set(path).isdisjoint(fine):
+        ground = list(map(grid.terrain_cell, fine))
+        for cell in reversed(path):
+            if (at := grid.terrain_cell(cell)) in ground:
+                leaves = len(ground) - 1 - ground[::-1].index(at)
+                way = crossed(grid, cell, fine[leaves])
+                more = len(way) - 1 - leaves
+                turns = turns and [*range(len(way)), *(turn + more for turn in turns if turn > leaves)]
+                return [*way, *fine[leaves + 1 :]], turns
+    return fine, turns

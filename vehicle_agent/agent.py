@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from shared_map.terrain.slope_and_climb import may_be_pulled
 from swarm.clock import NS_PER_S
 from swarm.config.scenario import AgentPlan, Scenario
-from swarm.grid import Window, walk
+from swarm.grid import Window, joined, walk
 from swarm.right_of_way.holdings import CellRequest, Holdings
 from swarm.runtime.tracker_ownership import Trackings
 from swarm.wire.messages.orders import GoalState
@@ -75,6 +75,7 @@ class Agent:
     dynamics   how fast vehicles drive; as the ground allows if not given
     group      costs published by the other agents of the group, if the assigner asks for them
 
+    grid        the cells of right of way
     stopped     whether an operator has stopped a vehicle
     assignment  asks for costs, and gives vehicles their targets
     """
@@ -99,12 +100,12 @@ class Agent:
         self.stopped: Callable[[str], bool] = lambda vehicle: False
         self._config = scenario.vehicles
         self._map = local_map
-        self.obstacles = obstacles or Obstacles(local_map.grid)
+        self.grid = grid = holdings.shards.grid
+        self.obstacles = obstacles or Obstacles(grid)
         self._sensor = sensor
         chance = random.Random(f"{scenario.seed}/{plan.id}/{plan.first}")
         config = scenario.vehicles
-        grid, pace = local_map.grid, local_map.pace
-        climb = local_map.climb
+        pace, climb = local_map.pace, local_map.climb
         self._steering = Steering(grid, pace, scenario.planner, config.reserve_cells, self.obstacles, climb)
         holdings.keeps = config.reserve_cells
         reach_cells = max(config.reserve_cells, FAR_CELLS) + FAR_CELLS
@@ -119,7 +120,7 @@ class Agent:
             pulled=self._pulled,
             measures=scenario.map.learning,
         )
-        self.goals = GoalQueues(lambda cell: self._steering.steps(cell) if cell < grid.cells else ())
+        self.goals = GoalQueues(lambda cell: self._steering.steps(cell) if cell < grid.cells else (), grid.middle)
         self._goals_taken = -1
         """Version of the goals by which the vehicles go."""
         self._look_due_ns = 0
@@ -139,7 +140,7 @@ class Agent:
         self.set_pace(scenario.time_scale, config.reassign_s)
         self._unassigned = False
         """True if vehicles have been placed that have no assignment yet."""
-        sense_cells = int(config.sense_range_m / grid.resolution_m) + 1
+        sense_cells = (int(config.sense_range_m / local_map.grid.resolution_m) + 1) * grid.parts
         self._sight_cells = max(sense_cells, reach_cells + 1)
         """Changes so near concern a vehicle, whatever its route: it looks there, or may hold a cell there."""
         self.seen_lethal: set[int] = set()
@@ -213,7 +214,8 @@ class Agent:
     def set_pace(self, time_scale: float, reassign_s: float) -> None:
         """Sets terrain seconds per second of the clock, and how often vehicles ask for the cheapest target."""
         self._time_scale = time_scale
-        self._driver.patience_ns = int(max(_PATIENCE_S, _PATIENCE * self._map.cell_s(0.5) / time_scale) * NS_PER_S)
+        cell_s = self._map.cell_s(0.5) / self.grid.parts
+        self._driver.patience_ns = int(max(_PATIENCE_S, _PATIENCE * cell_s / time_scale) * NS_PER_S)
         self.assignment.set_period(reassign_s)
 
     # --- where vehicles start -------------------------------------------------------------------------------
@@ -222,7 +224,7 @@ class Agent:
         """Adds vehicles whose places are known."""
         for id in vehicles:
             cell = self.holdings.path(id)[0]
-            self.vehicles[id] = Vehicle(id, self._map.grid, cell)
+            self.vehicles[id] = Vehicle(id, self.grid, cell)
             self._driver.entered[cell] = None
             self._unassigned = True
             self._goals_taken = -1
@@ -251,7 +253,8 @@ class Agent:
         return self._steering.shut_in & self.vehicles.keys()
 
     def set_ways_out(self, ways_out: Mapping[int, int]) -> None:
-        """Takes the cells closed only by an operator's zone, with the number of steps from each to its edge."""
+        """Takes the terrain's cells closed only by an operator's zone, with the number of steps from each to its
+        edge."""
         self.seen_lethal.intersection_update(ways_out)
         self._go_out(ways_out)
 
@@ -262,7 +265,7 @@ class Agent:
         self._steering.ways_out = ways_out
         self._cell_requests.make_anew()
         for vehicle in self.vehicles.values():
-            if vehicle.cell in ways_out:  # a step along the way before this one is not allowed any more
+            if vehicle.terrain_cell in ways_out:  # a step along the way before this one is not allowed any more
                 self._driver.end_path(vehicle)
 
     @property
@@ -272,8 +275,15 @@ class Agent:
 
     @property
     def places(self) -> list[int]:
-        """The cells that our vehicles hold."""
-        return list(chain.from_iterable(map(self.holdings.paths.__getitem__, self.vehicles)))
+        """The cells of the terrain with cells that our vehicles hold."""
+        held = chain.from_iterable(map(self.holdings.paths.__getitem__, self.vehicles))
+        return list(map(self.grid.terrain_cell, held))
+
+    @property
+    def shut_ground(self) -> set[int]:
+        """The cells of the terrain over which no way out leads: obstacles stand there, or vehicles have seen that
+        they are lethal."""
+        return self.seen_lethal.union(map(self.grid.terrain_cell, self.obstacles.standing))
 
     # --- driving --------------------------------------------------------------------------------------------
 
@@ -292,7 +302,7 @@ class Agent:
         self._driver.drive(self.stopped)
         if not self._driver.entered:
             return None
-        sight = self._sensor.look(list(self._driver.entered))
+        sight = self._sensor.look(list(dict.fromkeys(map(self.grid.terrain_cell, self._driver.entered))))
         self._driver.entered = {}
         if ways_out := self._steering.ways_out:
             # In a zone all is lethal by the map, so it cannot say which cells are so in truth.
@@ -311,14 +321,15 @@ class Agent:
     def map_changed(self, changed: Sequence[Window], now_ns: int, *, by_others: bool = False) -> None:
         """Cuts routes before newly lethal cells, and paths also before diagonal steps past one.
 
-        changed    the windows with all cells that have changed
+        changed    the windows with all cells of the terrain that have changed
         by_others  others may have changed the map: compare the view with it again
         """
+        changed = list(map(self.grid.finer, changed))
         self._cell_requests.ground_changed(changed)
         if not changed or not self.vehicles:
             return
         vehicles = list(self.vehicles.values())
-        cols, sight, pace = self._map.grid.cols, self._sight_cells, self._map.pace.reshape(-1)
+        cols, sight, pace = self.grid.cols, self._sight_cells, self._map.pace.reshape(-1)
         rows, east = np.divmod(np.array([vehicle.motion.cell for vehicle in vehicles], np.int64), cols)
         places = np.stack((rows - sight, east - sight, rows + sight, east + sight), 1)
         # A cell wider on each side: a diagonal step ends where a cell beside it is closed.
@@ -328,8 +339,8 @@ class Agent:
         on_route, in_sight = meet(np.concatenate((self._route_boxes, places)), changed).reshape(2, -1)
         for index in np.flatnonzero(on_route | in_sight).tolist():
             vehicle = vehicles[index]
-            ahead = vehicle.route.ahead()
-            if ahead and np.isinf(pace[ahead]).any() and vehicle.route.cut(self._steering.passable_steps):
+            ahead = self.grid.terrain_cell(np.array(vehicle.route.ahead(), np.int64))
+            if np.isinf(pace[ahead]).any() and vehicle.route.cut(self._steering.passable_steps):
                 vehicle.cut_route(now_ns)
             self._driver.end_path(vehicle)
             if by_others:
@@ -387,7 +398,7 @@ class Agent:
             reason = vehicle.route_request(now_ns)
             if reason is not None and vehicle.target is not None:
                 key = vehicle.target, reason is Reason.RAN_OUT
-                start = path[: self.holdings.keeps + 1][-1]
+                start = self.grid.terrain_cell(path[: self.holdings.keeps + 1][-1])
                 asks.setdefault(key, []).append((vehicle.id, start, reason))
             if stopped:
                 self._cell_requests.stay(vehicle.id)
@@ -434,11 +445,11 @@ class Agent:
         pose = self._poses.get(vehicle.target)
         if pose is None:
             return False
-        cols, resolution_m = self._map.grid.cols, self._map.grid.resolution_m
-        south, range_m = cell // cols - pose.cell // cols, self._config.capture_range_m
+        cols, resolution_m, at = self.grid.cols, self.grid.resolution_m, self.grid.middle(pose.cell)
+        south, range_m = cell // cols - at // cols, self._config.capture_range_m
         if abs(south) * resolution_m > range_m:  # nearly always: asked of each vehicle in each tick
             return False
-        return math.hypot(south, cell % cols - pose.cell % cols) * resolution_m <= range_m
+        return math.hypot(south, cell % cols - at % cols) * resolution_m <= range_m
 
     def _check_reach(self, vehicle: Vehicle) -> None:
         near = self._in_reach(vehicle, vehicle.cell)
@@ -553,8 +564,10 @@ class Agent:
                 self.goals.refused[vehicle.id] = route.status
                 vehicle.refuse_route(target, route.status, now_ns)
             return []
+        path = self.holdings.path(vehicle.id)
         try:
-            cells = walk(self._map.grid, route.start, route.directions)
+            given_cells = walk(self._map.grid, route.start, route.directions)
+            cells, turns = joined(self.grid, given_cells, route.turns if self._pulled else (), path)
         except ValueError:
             cells = []
         if not cells or (searching and not math.isfinite(route.cost_s)):
@@ -565,11 +578,9 @@ class Agent:
             self._unseen.add(target)
             self._poses.pop(target, None)
         partial = route.remaining_s > 0.0
-        turns = route.turns if self._pulled else ()
         given = GivenRoute(
-            target, tuple(cells), route.cost_s, route.lower_bound_s, partial, pushed, searching, turns
+            target, tuple(cells), route.cost_s, route.lower_bound_s, partial, pushed, searching, tuple(turns)
         )
-        path = self.holdings.path(vehicle.id)
         begun = vehicle.give_route(given, path, now_ns)
         if begun is None:
             return []

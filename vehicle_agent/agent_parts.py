@@ -17,10 +17,9 @@ from shared_map.vehicle_class_grounds import class_grounds
 from swarm.bus.bus import Bus, Post
 from swarm.clock import NS_PER_S
 from swarm.config.plugin_names import assignment_key
-from swarm.config.scenario import AgentPlan, plan_agents, readable_groups
+from swarm.config.scenario import AgentPlan, plan_agents, readable_groups, shard_side, traffic_grid
 from swarm.config.vehicle_classes import GROUND, class_named, class_numbers, flies, of_class
 from swarm.errors import ConfigError
-from swarm.grid import REGION_CELLS
 from swarm.plugins import named_plugin
 from swarm.right_of_way.agent_core import RightOfWay
 from swarm.right_of_way.agent_session import RightOfWaySync
@@ -75,6 +74,7 @@ class AgentParts:
         warn: Callable[[str, str], None],
     ) -> None:
         scenario, grid = setup.scenario, terrain.grid
+        traffic = traffic_grid(scenario, grid)
         plan = _plan_of(setup) if setup.added is None else setup.added.plan
         group, class_name = plan.group.name, plan.group.vehicle_class
         self.author, self.faults = f"{group}.{setup.author}", list[str]()
@@ -101,14 +101,15 @@ class AgentParts:
         spawns = spawn_cells(scenario, grid, grounds)
         layers = {each.id: flies(scenario, each.group.vehicle_class) for each in plan_agents(scenario)}
         beside = {agent: cells for agent, cells in spawns.items() if layers[agent] is self.flies}
-        side = scenario.map.shard_regions * REGION_CELLS
+        side = shard_side(scenario, traffic)
         others, proven = spawns.keys() - beside.keys(), scenario.network.tls is not None
-        shards = Shards(grid, list(beside), side, layer=int(self.flies), others=others, proven=proven)
+        shards = Shards(traffic, list(beside), side, layer=int(self.flies), others=others, proven=proven)
         tick_ns = int(NS_PER_S / scenario.vehicles.tick_hz)
         core = RightOfWay(
             setup.id, shards, beside, store.own, store.saved, vehicles=plan.vehicle_ids, tick_ns=tick_ns
         )
-        self.act_ns = int(self.maps.local.cell_s(0.0) / scenario.time_scale / _ACTS * NS_PER_S)
+        cell_s = self.maps.local.cell_s(0.0) / traffic.parts
+        self.act_ns = int(cell_s / scenario.time_scale / _ACTS * NS_PER_S)
         self.right_of_way = RightOfWaySync(core, setup, store, bus, post, warn, acts=self.act_ns < tick_ns)
 
         # The vehicles.
@@ -120,22 +121,22 @@ class AgentParts:
             named_plugin(scenario, assignment_key(scenario, group)), assigned, self.faults.append
         )
         self.costs = GroupCosts(self.author, group, setup.id) if shares_costs(assigner) else None
-        driven = DynamicsWorld(setup.id, grid, scenario.seed)
+        driven = DynamicsWorld(setup.id, traffic, scenario.seed)
         dynamics = own_dynamics(class_named(scenario, class_name), driven) or dynamics_of(
             named_plugin(scenario, "vehicles.dynamics"), driven, self.faults.append
         )
-        obstacles = Obstacles(grid, as_class.cost.vehicle_radius_m)
+        obstacles = Obstacles(traffic, as_class.cost.vehicle_radius_m)
         self.agent = Agent(
             plan, as_class, self.maps.local, sensor, core.host, obstacles, assigner, dynamics, self.costs
         )
         self.spawning: Spawning | None = None
         if setup.added is not None:
-            cells = entry_cells(setup.added, grid, own.homes, setup.incarnation)
-            self.spawning = Spawning(plan.vehicle_ids, cells, core.host, self.agent.is_open)
+            cells = map(traffic.middle, entry_cells(setup.added, grid, own.homes, setup.incarnation))
+            self.spawning = Spawning(plan.vehicle_ids, list(cells), core.host, self.agent.is_open)
 
         # The targets, and messages to vehicles.
         self.detector = TargetDetector(grid, self.author, group, range_m, reads, scenario.untracked)
-        self.target_obstacles = TargetObstacles(scenario, grid)
+        self.target_obstacles = TargetObstacles(scenario, traffic)
         self.fleet = FleetReport(self.author, group, class_name)
         self.chasers = ChasersReport(self.author, class_name)
 

@@ -62,18 +62,19 @@ def arrival_cells(goal: int, vehicles: int, steps: Callable[[int], Iterable[int]
 class GoalQueues:
     """Goals of the vehicles of one agent.
 
-    steps    cells to which a vehicle may drive from a cell
+    steps    cells of right of way to which a vehicle may drive from one
+    middle   the one in the middle of a cell of the terrain: of a place
 
     book     where they are sent; the owner merges what keepers tell
     shared   cell -> how many vehicles of all agents were sent there, where it is more than one
     refused  vehicle -> the status with which its last question for a route was refused
     """
 
-    def __init__(self, steps: Callable[[int], Iterable[int]]) -> None:
+    def __init__(self, steps: Callable[[int], Iterable[int]], middle: Callable[[int], int]) -> None:
         self.book = GoalBook()
         self.shared: Mapping[int, int] = {}
         self.refused: dict[str, str] = {}
-        self._steps = steps
+        self._steps, self._middle = steps, middle
         self._arrivals: dict[int, frozenset[int]] = {}
 
     def look_again(self) -> None:
@@ -90,13 +91,15 @@ class GoalQueues:
         goals, before = self.book.in_force(vehicle), goal
         if goals is not None and goals.then == "repeat":
             before = goals.cells[goals.done % len(goals.cells) - 1]
-        return cell == goal or (cell in self._near(goal) and (before == goal or cell not in self._near(before)))
+        return cell == self._middle(goal) or (
+            cell in self._near(goal) and (before == goal or cell not in self._near(before))
+        )
 
     def _near(self, goal: int) -> frozenset[int]:
         """The cells on which a vehicle reaches a place."""
         if goal not in self._arrivals:
             vehicles = min(self.shared.get(goal, 1), MOST_SENT)  # whatever is told, the work is bounded
-            self._arrivals[goal] = arrival_cells(goal, vehicles, self._steps)
+            self._arrivals[goal] = arrival_cells(self._middle(goal), vehicles, self._steps)
         return self._arrivals[goal]
 
     def reached(self, vehicle: str, goal: int, now_ns: int) -> bool:

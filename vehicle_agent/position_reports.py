@@ -41,7 +41,8 @@ class ChasersReport:
         """Returns the messages that are due: about targets which a vehicle took or left, which have a vehicle that
         left its published cell, or for which `HEARTBEAT_NS` passed without a message.
 
-        vehicles  id, target and path of each: the cells that it may stand on or enter, in order, at least one
+        vehicles  id, target and path of each: the cells of the terrain that it may stand on or enter, in order, at
+                  least one
         """
         chasers: dict[str | None, dict[str, tuple[Sequence[int], int | None]]] = {each: {} for each in self._told}
         for id, target, path in vehicles:

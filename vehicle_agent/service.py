@@ -190,7 +190,7 @@ class AgentService(MemberService):
             self._take_obstacles(now_ns)  # a process that was stopped acts before its next tick
             self._drive(now_ns)
             self._perform(self.agent.decide(now_ns))
-            self._report(Places(self._replica.grid, self.agent.vehicles.values()), now_ns)
+            self._report(Places(self.agent.grid, self.agent.vehicles.values()), now_ns)
             self._right_of_way.tick(self.agent.cell_requests, now_ns)
 
     def _report(self, places: Places, now_ns: int) -> None:
@@ -224,7 +224,7 @@ class AgentService(MemberService):
         if agent.holdings.replaced and agent.vehicles:
             self._stand_down(now_ns)
         places = agent.places
-        parts.zones.update(places, now_ns, agent.obstacles.standing | agent.seen_lethal)
+        parts.zones.update(places, now_ns, agent.shut_ground)
         agent.set_ways_out(parts.zones.ways_out)
         self._obey(now_ns)
         self._set_planners(now_ns)
@@ -233,16 +233,19 @@ class AgentService(MemberService):
             self._sync.enter(parts.near_marks.update(places))
         self._take_obstacles(now_ns)
         self._drive(now_ns)
-        columns = Places(self._replica.grid, agent.vehicles.values())
+        columns = Places(agent.grid, agent.vehicles.values())
         self._tell_sighted(columns, now_ns)
         self._perform(agent.decide(now_ns))
         self.counters.count("blocked_ticks", agent.blocked_ticks)
         self.counters.counts["sets_foreign"] = self._replica.counts["sets_foreign"]
         self._report(columns, now_ns)
-        paths = agent.holdings.paths
+        paths, terrain_cell = agent.holdings.paths, agent.grid.terrain_cell
         self._tell_goals(now_ns)
         kept = agent.holdings.keeps + 1
-        chasing = [(id, vehicle.target, paths[id][:kept]) for id, vehicle in agent.vehicles.items()]
+        chasing = [
+            (id, vehicle.target, list(map(terrain_cell, paths[id][:kept])))
+            for id, vehicle in agent.vehicles.items()
+        ]
         for chasers in parts.chasers.reports(chasing, now_ns):
             if chasers.target is None:
                 self._bus.publish(topics.SENT, chasers, places=self._places_job, author=self._author)
@@ -401,7 +404,7 @@ class AgentService(MemberService):
         obstacles.complaints.clear()
         shut_in = self.agent.shut_in
         for id in sorted(shut_in - self._shut_in):
-            cell = self.agent.vehicles[id].cell
+            cell = self.agent.vehicles[id].terrain_cell
             row, col = self._replica.grid.row_col(cell)
             text = f"{id} waits at row {row}, column {col}: obstacles leave no cell to which it can drive"
             self._warn("shut_in", text)

@@ -17,7 +17,7 @@ from shared_map.array_files import CellsOf, private_copy
 from shared_map.terrain.map_frame import MapFrame
 from shared_map.vehicle_class_grounds import ClassGround
 from swarm.clock import NS_PER_S
-from swarm.config.scenario import AddedAgent, GroupConfig, Scenario, plan_agents
+from swarm.config.scenario import AddedAgent, GroupConfig, Scenario, plan_agents, traffic_grid
 from swarm.errors import ConfigError
 from swarm.grid import GridSpec
 from swarm.places import cell_of, written
@@ -32,8 +32,9 @@ _TRIES = 64
 def spawn_cells(
     scenario: Scenario, grid: GridSpec, grounds: Mapping[str, ClassGround]
 ) -> dict[str, dict[str, int]]:
-    """Returns agent -> vehicle -> cell, of the whole run. All cells differ, and each lies in the largest connected
-    part which the vehicle's class can drive, except those that the scenario names.
+    """Returns agent -> vehicle -> cell of right of way, of the whole run: the middle one of a cell of the terrain.
+    All cells differ, and each lies in the largest connected part which the vehicle's class can drive, except those
+    that the scenario names.
 
     grounds  of every class that vehicles belong to
 
@@ -51,13 +52,14 @@ def spawn_cells(
     for homes in free.values():
         homes[list(taken)] = False
     placed: dict[str, list[int]] = {}
+    traffic = traffic_grid(scenario, grid)
     for group in scenario.groups:
         chosen = explicit[group.name]
         own = free[group.vehicle_class]
         chosen += _choose(group, group.vehicles - len(chosen), grid, own, scenario.seed)
         for homes in free.values():
             homes[chosen] = False
-        placed[group.name] = chosen
+        placed[group.name] = list(map(traffic.middle, chosen))
     return {
         plan.id: dict(zip(plan.vehicle_ids, placed[plan.group.name][plan.first :], strict=False))
         for plan in plan_agents(scenario)

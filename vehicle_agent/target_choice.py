@@ -196,7 +196,7 @@ class Assignment:
         """The request to send now, under this number."""
         self._costs_s = {}
         vehicles = self._choosing()
-        self._open = AskCosts(request, tuple(vehicles), tuple(vehicle.cell for vehicle in vehicles.values()))
+        self._open = AskCosts(request, tuple(vehicles), tuple(each.terrain_cell for each in vehicles.values()))
         first = self._due_ns == 0
         self._due_ns = now_ns + (self._stagger_ns if first else self._reassign_ns)
         self._asked_ns = now_ns

@@ -11,9 +11,11 @@ with connect("tcp/127.0.0.1:7447") as swarm, swarm.vehicle("rover", right_of_way
     if route is None:
         raise SystemExit("no planner answers for t0: `swarm status` names the targets")
     while not route.arrived:
-        if rover.cell in route.cells:
-            ahead = route.cells[route.cells.index(rover.cell) + 1 :][:4]
+        cells = rover.cells_of(route)
+        if rover.traffic_cell in cells:
+            ahead = cells[cells.index(rover.traffic_cell) + 1 :][:4]
             for cell in rover.reserve(ahead, timeout_s=1.0)[:1]:  # none: reserved by another, so wait
-                rover.at(*swarm.frame.centre_m(cell))  # here your wheels; others may enter the cells behind it now
+                x_m, y_m = swarm.frame.traffic.centre_m(cell)
+                rover.at(x_m, y_m)  # here your wheels; others may enter the cells behind it now
         time.sleep(0.1)
         route = routes.newest

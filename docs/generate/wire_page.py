@@ -134,7 +134,7 @@ def default_text(field: msgspec.structs.FieldInfo) -> str:
     if field.required:
         return REQUIRED
     value = field.default if field.default is not msgspec.NODEFAULT else field.default_factory()
-    return repr(value)
+    return "absent" if value is msgspec.UNSET else repr(value)
 
 
 def type_text(hint: Any) -> str:
@@ -143,7 +143,8 @@ def type_text(hint: Any) -> str:
     if origin is Annotated:
         return _bounded(*taken_apart(hint))
     if origin in (types.UnionType, typing.Union):
-        return "|".join("nil" if arg is type(None) else type_text(arg) for arg in args)
+        given = [arg for arg in args if arg is not msgspec.UnsetType]
+        return "|".join("nil" if arg is type(None) else type_text(arg) for arg in given)
     if origin is typing.Literal:
         return "|".join(map(repr, args))
     if origin is list:

@@ -154,7 +154,8 @@ def forget(name: str, where: Where) -> None:
     """
     with where.operators_bus() as (bus, found):
         run = found[0]
-        if not say_gone(bus, name, GridSpec(run.rows, run.cols, run.resolution_m), _WITHIN_S):
+        grid = GridSpec(run.rows, run.cols, run.resolution_m).traffic(run.traffic_parts or 1)
+        if not say_gone(bus, name, grid, _WITHIN_S):
             needs = f"this needs the certificate of {name} itself (--tls-dir FOLDER); with it, " * bus.proves_names
             raise BusError(f"the cells of {name} are not known to be free after {_WITHIN_S:g} s: {needs}repeat it")
     typer.echo(f"{name} is removed, and its cells are free")

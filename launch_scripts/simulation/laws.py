@@ -32,7 +32,7 @@ from shared_map.replication.replica import MapReplica
 from shared_map.vehicle_class_grounds import class_grounds
 from swarm.bus.bus import Event, Heard
 from swarm.clock import NS_PER_S
-from swarm.config.scenario import plan_agents
+from swarm.config.scenario import plan_agents, traffic_grid
 from swarm.config.vehicle_classes import flies
 from swarm.errors import ProtocolError
 from swarm.wire.codec import decode
@@ -142,9 +142,10 @@ class LawBook:
         self.whole_s: float | None = None
         self.routed_s: dict[str, float] = {}
         scenario, grid = simulation.scenario, simulation.terrain.grid
+        self._traffic = traffic_grid(scenario, grid)
         grounds = class_grounds(scenario, simulation.terrain, simulation.truth)
         self._grounds = {of: TrueTerrain(grid, g.truth, g.terrain.climb, g.homes) for of, g in grounds.items()}
-        self._across_m = math.sqrt(2) * grid.resolution_m / scenario.time_scale
+        self._across_m = math.sqrt(2) * self._traffic.resolution_m / scenario.time_scale
         plans = plan_agents(scenario)
         self._vehicles = [id for plan in plans for id in plan.vehicle_ids]
         self._aloft = {id for plan in plans if flies(scenario, plan.group.vehicle_class) for id in plan.vehicle_ids}
@@ -193,8 +194,9 @@ class LawBook:
         ground = self._grounds[agent.plan.group.vehicle_class]
         truth = ground.pace_s_per_m.reshape(-1)
         for id, vehicle in agent.vehicles.items():
+            pace = truth.item(vehicle.terrain_cell)
             if cells.get(id) != vehicle.cell:
-                if not math.isfinite(truth[vehicle.cell]):
+                if not math.isfinite(pace):
                     text = f"lethal entry at {now_s:.2f} s: {id} on cell {vehicle.cell}"
                     self.lethal.append(BrokenLaw("no lethal entry", text, now_s))
                 if id in cells:
@@ -205,7 +207,7 @@ class LawBook:
                 self.routed_s[id] = now_s
             to_go = vehicle.state in _UNDER_WAY and not (agent.stopped(id) or id in agent.shut_in)
             counts_s = 0.0 if disturbed else (now_ns - ticked_ns) / NS_PER_S
-            self._wait(vehicle, to_go, counts_s, self._across_m * truth.item(vehicle.cell))
+            self._wait(vehicle, to_go, counts_s, self._across_m * pace)
         if agent.holdings.replaced:  # its successor drives them; it may begin again later, and then holds nothing
             cells.clear()
         self._collide()
@@ -215,12 +217,12 @@ class LawBook:
         if vehicle.state is not VehicleState.STRANDED:
             return vehicle.state in _ROUTED
         poses = self.simulation.recorder.observed.poses.values()
-        return ground.reached_from(vehicle.cell).isdisjoint(pose.cell for pose in poses)
+        return ground.reached_from(vehicle.terrain_cell).isdisjoint(pose.cell for pose in poses)
 
     def _obstacles_entered(self, generation: _Generation, vehicle: Vehicle, ticked_ns: int) -> Iterator[BrokenLaw]:
         """The obstacles onto which a vehicle has driven since the last tick of its agent."""
         now_ns, now_s = self.simulation.now_ns, self.simulation.now_s
-        grid, middle = self.simulation.terrain.grid, self.simulation.terrain.grid.centre_m(vehicle.cell)
+        grid, middle = self._traffic, self._traffic.centre_m(vehicle.cell)
         for obstacle, at_ns in generation.reports.values():
             lasts = at_ns <= ticked_ns and now_ns < at_ns + obstacle.lease_s * NS_PER_S
             near = math.dist(middle, (obstacle.x_m, obstacle.y_m)) <= obstacle.radius_m + grid.resolution_m

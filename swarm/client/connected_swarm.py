@@ -265,7 +265,7 @@ class Swarm:
 
         generations = GenerationFile(file or state_folder() / "vehicles" / self.run_id / id)
         try:
-            return ExternalSession(id, self.frame.grid, self._open_trusted(), generations)
+            return ExternalSession(id, self.frame.traffic, self._open_trusted(), generations)
         except BaseException:
             generations.close()
             raise
@@ -451,5 +451,6 @@ def agreed(answers: Sequence[tuple[RunInfo, int]], where: str) -> tuple[RunInfo,
     return of_run[0][0], ahead_ns[len(ahead_ns) // 2] if ahead_ns else 0
 
 
-def _grid_of(info: RunInfo) -> tuple[str, int, int, float, float, float, str]:
-    return info.run_id, info.rows, info.cols, info.resolution_m, info.west_m, info.north_m, info.crs
+def _grid_of(info: RunInfo) -> tuple[str, int, int, float, float, float, str, int]:
+    parts = info.traffic_parts or 1
+    return info.run_id, info.rows, info.cols, info.resolution_m, info.west_m, info.north_m, info.crs, parts

@@ -22,19 +22,20 @@ class Frame:
     """Coordinates on a swarm's terrain. `x_m` grows to the east and `y_m` to the north, in the coordinate system
     `crs` ("local" is metres from anywhere). A cell is `row * cols + col`, row 0 in the north.
 
-    grid  shape and place of the terrain
+    grid     shape and place of the terrain
+    traffic  the cells of right of way: the terrain's, or smaller ones
     """
 
-    def __init__(self, grid: GridSpec) -> None:
-        self.grid = grid
+    def __init__(self, grid: GridSpec, parts: int = 1) -> None:
+        self.grid, self.traffic = grid, grid.traffic(parts)
 
     @classmethod
     def of(cls, info: RunInfo) -> Frame:
         """Builds the frame from the reply of a process of the run. Raises ConfigError if it has no grid."""
         try:
-            return cls(
-                GridSpec(info.rows, info.cols, info.resolution_m, info.west_m, info.north_m, info.crs or "local")
-            )
+            crs = info.crs or "local"
+            grid = GridSpec(info.rows, info.cols, info.resolution_m, info.west_m, info.north_m, crs)
+            return cls(grid, info.traffic_parts or 1)
         except ValueError as error:
             raise ConfigError(f"{info.role} {info.id} answers with a grid that is none: {error}") from error
 
@@ -63,11 +64,11 @@ class Frame:
 
     def written(self, cell: int) -> str:
         """A cell for people, in each form that `cell_named` reads. Raises as `centre_m` and `to_wgs84`."""
-        return written(self, checked_cell(self, cell))
+        return written(self, checked_cell(self.grid, cell))
 
     def centre_m(self, cell: int) -> Point:
         """(x_m, y_m) of the middle of a cell. Raises ConfigError on one outside the terrain."""
-        return self.grid.centre_m(checked_cell(self, cell))
+        return self.grid.centre_m(checked_cell(self.grid, cell))
 
     def cells_within(self, x_m: float, y_m: float, radius_m: float) -> list[int]:
         """Returns the cells whose middle is within `radius_m` of a place inside the terrain, and its own cell."""
@@ -121,11 +122,11 @@ def _degrees_of(system: Any) -> str:
     return f"+proj=longlat +a={ellipsoid.semi_major_metre!r} +b={ellipsoid.semi_minor_metre!r} +no_defs"
 
 
-def checked_cell(frame: Frame, given: int) -> int:
-    """A cell of the terrain. Raises ConfigError on one outside the terrain, and on a value that is not a cell."""
+def checked_cell(grid: GridSpec, given: int) -> int:
+    """A cell of a grid. Raises ConfigError on one outside the terrain, and on a value that is not a cell."""
     cell = whole("cell", given)
-    if not 0 <= cell < frame.grid.cells:
-        raise ConfigError(f"cell {cell} is outside the terrain of {frame.grid.rows} x {frame.grid.cols} cells")
+    if not 0 <= cell < grid.cells:
+        raise ConfigError(f"cell {cell} is outside the terrain of {grid.rows} x {grid.cols} cells")
     return cell
 
 

@@ -15,7 +15,7 @@ from swarm.client.terrain_frame import checked_cell, listed
 from swarm.clock import NS_PER_S
 from swarm.config.scenario import agent_of
 from swarm.errors import ConfigError
-from swarm.grid import TILE_CELLS, GridSpec, shown
+from swarm.grid import TILE_CELLS, GridSpec, joined, shown
 from swarm.wire.messages import map_data, planning
 from swarm.wire.messages.vehicles import LONGEST_OBSTACLE_LEASE_S, MOST_M_PER_S, MOST_RADIUS_M, Obstacle
 from swarm.wire.route_columns import RouteStatus
@@ -199,7 +199,7 @@ class Vehicle(Reported):
         """
         session = self._session
         with session.lock:
-            cell = self._cell_at(x_m, y_m)
+            self._cell_at(x_m, y_m)
             if heading_rad is not None:
                 heading_rad = session.number("heading_rad", heading_rad)
             self._say(
@@ -210,15 +210,28 @@ class Vehicle(Reported):
                 speed_m_per_s=session.number("speed_m_per_s", speed_m_per_s, 0, MOST_M_PER_S),
                 radius_m=self.radius_m,
             )
-        if self._way is not None and not self._way.stands(self._way.counted(cell, x_m, y_m)):
+        if self._way is not None and not self._way.stands(self._counted(self._way)):
+            cell = self.traffic_cell
             session.problem("unreserved", f"vehicle {self.id} is in cell {cell}, into which it was not let: stop")
 
     @property
     def cell(self) -> int:
-        """Cell of the last reported position. Raises ConfigError before the first `at`."""
+        """Cell of the terrain of the last reported position. Raises ConfigError before the first `at`."""
+        word = self._reported
+        return self._session.frame.cell(word.x_m, word.y_m)
+
+    @property
+    def traffic_cell(self) -> int:
+        """Cell of right of way of the last reported position. Raises as `cell`."""
+        word = self._reported
+        return self._session.frame.traffic.cell_at(word.x_m, word.y_m)
+
+    @property
+    def _reported(self) -> Obstacle:
         if self._word is None:
             raise ConfigError(f"vehicle {self.id} has not said where it is: call at() first")
-        return self._session.frame.cell(self._word.x_m, self._word.y_m)
+        word: Obstacle = self._word
+        return word
 
     # --- right of way -------------------------------------------------------------------------------------------
 
@@ -227,17 +240,18 @@ class Vehicle(Reported):
         self._way = way
 
     def reserve(self, cells: Sequence[int], timeout_s: float = 0.0) -> list[int]:
-        """Requests cells in driving order, such as the next ones of a route, and waits up to `timeout_s` (s) until
-        the vehicle may enter the first. Returns the cells that it may enter now: no other vehicle enters
-        them before the vehicle has left them by its `at`. Reserved cells that are not in `cells` are released.
+        """Requests cells of right of way in driving order, such as the next ones of `cells_of` a route, and waits
+        up to `timeout_s` (s) until the vehicle may enter the first. Returns the cells that it may enter now: no
+        other vehicle enters them before the vehicle has left them by its `at`. Reserved cells that are not in
+        `cells` are released.
 
         Raises ConfigError if a cell is not beside the one before it, and unless the vehicle was made with
         `right_of_way`.
         """
-        way, cell, word = self._has_way(), self.cell, self._word
-        here = cell if word is None else way.counted(cell, word.x_m, word.y_m)
-        wanted = [checked_cell(self._session.frame, cell) for cell in listed("cells", cells)]
-        path = [here, *(wanted[1:] if wanted[:1] in ([here], [cell]) else wanted)]
+        way = self._has_way()
+        here, traffic = self._counted(way), self._session.frame.traffic
+        wanted = [checked_cell(traffic, cell) for cell in listed("cells", cells)]
+        path = [here, *(wanted[1:] if wanted[:1] in ([here], [self.traffic_cell]) else wanted)]
         try:
             way.want(path)
         except ValueError as error:
@@ -250,7 +264,18 @@ class Vehicle(Reported):
         """Returns True if the vehicle may drive into a cell now, after waiting up to a timeout. Raises ConfigError
         unless it was made with `right_of_way`."""
         wait_s = self._session.number("timeout_s", timeout_s, 0, 1e9)
-        return self._has_way().may_enter(checked_cell(self._session.frame, cell), wait_s)
+        return self._has_way().may_enter(checked_cell(self._session.frame.traffic, cell), wait_s)
+
+    def cells_of(self, route: Route) -> list[int]:
+        """Returns the cells of right of way of a route, from where the vehicle is if the route passes its cell.
+        Without `map.traffic_cell_m` in the scenario they are those of the route."""
+        here, cells = self.traffic_cell, route.cells
+        way, _ = joined(self._session.frame.traffic, cells, (), [here]) if cells else ([], [])
+        return way[way.index(here) :] if here in way else way
+
+    def _counted(self, way: ExternalSession) -> int:
+        """The cell of right of way in which it counts at its last reported position."""
+        return way.counted(self.traffic_cell, self._reported.x_m, self._reported.y_m)
 
     def _has_way(self) -> ExternalSession:
         if self._way is None:
@@ -405,7 +430,7 @@ class Vehicle(Reported):
         with session.lock:
             session.check_open()
             try:
-                once = dict.fromkeys(checked_cell(session.frame, cell) for cell in listed("cells", cells))
+                once = dict.fromkeys(checked_cell(session.frame.grid, cell) for cell in listed("cells", cells))
             except ConfigError as error:
                 raise session.refused(str(error)) from None
             if not once:

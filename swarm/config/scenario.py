@@ -7,6 +7,7 @@ or value is rejected with the file, the key, the value found and the values allo
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from typing import Annotated, Literal
 
@@ -31,8 +32,8 @@ from swarm.config.setting_types import (
     plugin_name,
 )
 from swarm.config.vehicle_classes import GROUND, MOST_CLASSES, ClassConfig, WindConfig
-from swarm.errors import ConfigError
-from swarm.grid import MOST_SHARD_REGIONS
+from swarm.errors import ArgumentError, ConfigError
+from swarm.grid import MOST_SHARD_REGIONS, REGION_CELLS, GridSpec
 from swarm.peers import ranked_id
 
 Walk = Literal["still", "random", "waypoints", "evade", "external"]
@@ -213,6 +214,9 @@ class MapConfig(Section, frozen=True, kw_only=True):
     shard_regions       side of a shard of right of way, in regions of 256 x 256 cells. Agents send messages about
                         each shard at each tick: few agents on a large map need larger shards. Equal for all
                         processes of a run
+    traffic_cell_m      side of a cell of right of way, of which a vehicle occupies one: the side of the terrain's
+                        cell, which is the default, divided by an odd number. Smaller cells let more vehicles onto a
+                        road, and need more messages. Equal for all processes of a run
     digest_s            interval at which each replica publishes which sets it holds
     author_marks_per_s  a process above this for ten seconds raises an alarm, and its sets are delayed
     total_marks_per_s   the same for all processes together: the sets of those above an equal share are delayed
@@ -225,6 +229,7 @@ class MapConfig(Section, frozen=True, kw_only=True):
     interest: Literal["all", "near"] = "all"
     interest_m: Positive = 2000.0
     shard_regions: Annotated[int, Meta(ge=1, le=MOST_SHARD_REGIONS)] = 1
+    traffic_cell_m: Positive | None = None
     digest_s: Positive = 1.0
     author_marks_per_s: Positive = 20_000.0
     total_marks_per_s: Positive = 100_000.0
@@ -388,6 +393,35 @@ def added_agent(
         most = scenario.vehicles.per_agent
         raise ConfigError(f"an agent hosts 1 to {most} vehicles (vehicles.per_agent), not {count}")
     return AddedAgent(AgentPlan(id, groups[group], 0, count), at)
+
+
+_ROUNDED = 1e-6
+"""By this share the parts of a cell may miss its side: a third of 10 m has no end in decimals."""
+
+
+def traffic_grid(scenario: Scenario, terrain: GridSpec) -> GridSpec:
+    """The cells of right of way of a run. Raises ConfigError if `map.traffic_cell_m` does not divide the terrain's
+    cell by an odd number, or makes too many cells."""
+    side_m = scenario.map.traffic_cell_m
+    if side_m is None:
+        return terrain
+    cell_m = terrain.resolution_m
+    parts = round(cell_m / side_m)
+    if parts % 2 == 0 or parts > MOST_SHARD_REGIONS or not math.isclose(parts * side_m, cell_m, rel_tol=_ROUNDED):
+        some = ", ".join(f"{cell_m / odd:.6g}" for odd in (1, 3, 5, 7))
+        raise ConfigError(
+            f"map.traffic_cell_m is {side_m:g}, expected the terrain's cell of {cell_m:g} m divided by an odd"
+            f" number: {some}, ..."
+        )
+    try:
+        return terrain.traffic(parts)
+    except ArgumentError as error:
+        raise ConfigError(f"map.traffic_cell_m is {side_m:g}: {error}") from error
+
+
+def shard_side(scenario: Scenario, traffic: GridSpec) -> int:
+    """Side of a shard of right of way, in cells of right of way."""
+    return min(scenario.map.shard_regions * traffic.parts, MOST_SHARD_REGIONS) * REGION_CELLS
 
 
 def crew_of(scenario: Scenario) -> list[tuple[str, str]]:

@@ -115,7 +115,8 @@ class RightOfWay:
         if request.agent == self.agent or self.silent or self._is_external:
             return []
         if request.agent not in self.spawns or not request.disk:
-            if not self._has_quorum:
+            own = self.shards.side, REGION_CELLS * self.shards.grid.parts  # an added agent knows its shards
+            if not self._has_quorum or request.shard_cells not in own:
                 return []
             known = self._known_of(request.agent, request.disk)
             return [

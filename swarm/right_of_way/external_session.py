@@ -18,7 +18,7 @@ from hashlib import blake2s
 from swarm.bus.bus import Appeared, AskEnded, Bus, Disappeared, Event, Heard, Post, Replied
 from swarm.clock import NS_PER_S, MonotonicClock
 from swarm.errors import BusError, ConfigError, SwarmError
-from swarm.grid import GridSpec
+from swarm.grid import REGION_CELLS, GridSpec
 from swarm.peers import Peer
 from swarm.right_of_way.external_vehicle import Answers, ExternalVehicle, Removal
 from swarm.right_of_way.generations import MemoryGenerations
@@ -47,6 +47,7 @@ class ExternalService:
     a certificate of the external vehicle, `rover.GROUP.NAME`.
 
     name         of the external vehicle, as in its certificate; no agent of the scenario has it
+    grid         the cells of right of way
     incarnation  nanosecond of this process's start, which tells its liveliness token from that of another
     warn         called with a sentence about what cannot be, or why the vehicle waits
 
@@ -182,7 +183,7 @@ class ExternalService:
 
     def _ask(self, now_ns: int) -> None:
         self._asking, self._tag = True, f"known-{self.name}-{now_ns}"  # what answers an earlier query is too old
-        request = KnownRequest(agent=self.name, disk=0)
+        request = _question(self.name, self.grid)
         self.bus.ask(KNOWN, request, self.post, tag=self._tag, timeout_s=_ANSWERS_S)
 
     def _perform(self, actions: Sequence[object], now_ns: int) -> None:
@@ -230,7 +231,7 @@ class ExternalSession:
     or an operator removes the vehicle (`swarm order vehicle forget`).
 
     name         of the vehicle, unlike all agents of the scenario
-    grid         of the run's map
+    grid         the run's cells of right of way
     bus          opened with the run's secret, or with the vehicle's certificate, `rover.GROUP.NAME`
     generations  the vehicle's file; closed with this session, as the bus is
     """
@@ -394,10 +395,16 @@ _WORDS_S = 0.5
 """An operator waits for agents' answers for this time, and asks again: one round is enough where no agent hangs."""
 
 
+def _question(name: str, grid: GridSpec) -> KnownRequest:
+    """Asks what agents know of an external vehicle; those answer which have the same cells of right of way."""
+    return KnownRequest(agent=name, disk=0, shard_cells=REGION_CELLS * grid.parts)
+
+
 def say_gone(bus: Bus, name: str, grid: GridSpec, timeout_s: float) -> bool:
     """Removes an external vehicle, and waits until its cells are free. Returns whether they are within the timeout.
 
-    bus  opened with the run's secret, or the external vehicle's own certificate
+    bus   opened with the run's secret, or the external vehicle's own certificate
+    grid  the run's cells of right of way
 
     Raises ConfigError where no such external vehicle is known, or it is no external vehicle, or its program still
     runs.
@@ -408,7 +415,7 @@ def say_gone(bus: Bus, name: str, grid: GridSpec, timeout_s: float) -> bool:
     bus.watch_alive(inbox.post)
     bus.subscribe(GRANTED, inbox.post, host=name)
     bus.subscribe(WORD, inbox.post, host=name)
-    bus.ask(KNOWN, KnownRequest(agent=name, disk=0), inbox.post, tag="known", timeout_s=_WORDS_S)
+    bus.ask(KNOWN, _question(name, grid), inbox.post, tag="known", timeout_s=_WORDS_S)
     removal: Removal | None = None
     begun, due_ns = False, 0
     until_ns = clock.now_ns() + int(timeout_s * NS_PER_S)
@@ -434,7 +441,7 @@ def say_gone(bus: Bus, name: str, grid: GridSpec, timeout_s: float) -> bool:
                 begun = True
             case AskEnded() if not begun:
                 answers.end_query()
-                bus.ask(KNOWN, KnownRequest(agent=name, disk=0), inbox.post, tag="known", timeout_s=_WORDS_S)
+                bus.ask(KNOWN, _question(name, grid), inbox.post, tag="known", timeout_s=_WORDS_S)
             case Heard(message=(Granted() | Word()) as granted) if removal is not None:
                 removal.host.hear_granted(granted, now_ns)
             case _:

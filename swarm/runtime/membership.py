@@ -344,7 +344,8 @@ def check_belongs(mine: RunInfo, others: Iterable[RunInfo]) -> None:
 def check_same_run(mine: RunInfo, other: RunInfo) -> None:
     """Raises RunMismatchError, with a sentence on the difference, if two processes must not share a namespace.
 
-    They may if run id, terrain, size of shards and vehicle classes are equal, and their wire versions neighbours.
+    They may if run id, terrain, sizes of shards and of cells of right of way, and vehicle classes are equal, and
+    their wire versions neighbours.
     """
     who = f"{other.role} {other.id}"
     if other.run_id != mine.run_id:
@@ -366,6 +367,11 @@ def check_same_run(mine: RunInfo, other: RunInfo) -> None:
         raise RunMismatchError(
             f"{mine.role} {mine.id} has shards of right of way of {mine.shard_cells} cells a side, but {who} has "
             f"{other.shard_cells}: map.shard_regions differs, or was set by a version that does not know it"
+        )
+    if other.traffic_parts != mine.traffic_parts:
+        raise RunMismatchError(
+            f"{mine.role} {mine.id} has {mine.traffic_parts or 1} cells of right of way across a cell of the"
+            f" terrain, but {who} has {other.traffic_parts or 1}: map.traffic_cell_m differs"
         )
     if other.classes != mine.classes:
         raise RunMismatchError(

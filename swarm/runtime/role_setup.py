@@ -5,9 +5,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from pathlib import Path
 
-from swarm.config.scenario import AddedAgent, Scenario, crew_of
+from msgspec import UNSET
+
+from swarm.config.scenario import AddedAgent, Scenario, crew_of, shard_side, traffic_grid
 from swarm.config.vehicle_classes import class_numbers
-from swarm.grid import REGION_CELLS, GridSpec
+from swarm.grid import GridSpec
 from swarm.runtime.loop_health import Health
 from swarm.wire.fields import MOST_IDS
 from swarm.wire.messages import WIRE_VERSION
@@ -48,6 +50,7 @@ class RoleSetup:
 
     def info(self, grid: GridSpec, terrain_digest: str) -> RunInfo:
         """Returns this process's reply to the question which run it belongs to."""
+        traffic = traffic_grid(self.scenario, grid)
         return RunInfo(
             run_id=self.run_id,
             role=self.role,
@@ -67,7 +70,8 @@ class RoleSetup:
             restarts=self.restarts,
             classes=list(class_numbers(self.scenario)),
             wire_version=WIRE_VERSION,
-            shard_cells=self.scenario.map.shard_regions * REGION_CELLS,
+            shard_cells=shard_side(self.scenario, traffic),
+            traffic_parts=traffic.parts if traffic.parts > 1 else UNSET,
         )
 
     @property

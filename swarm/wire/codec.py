@@ -348,7 +348,7 @@ def _turned(value: Any, hint: Any, place: str, turn: Callable[[Any, Column, str]
     bare, notes = taken_apart(hint)
     kind, args = typing.get_origin(bare) or bare, typing.get_args(bare)
     if kind in (types.UnionType, typing.Union):
-        (one,) = (arg for arg in args if arg is not types.NoneType)
+        (one,) = (arg for arg in args if arg not in (types.NoneType, msgspec.UnsetType))
         return None if value is None else _turned(value, one, place, turn)
     if kind is bytes:
         return turn(value, next((note for note in notes if isinstance(note, Column)), _BYTE_COLUMN), place)

@@ -29,7 +29,7 @@ from launch_scripts.simulation.world.referee import Referee
 from shared_map.terrain.terrain import build_terrain
 from shared_map.terrain.true_ground import build_truth
 from shared_map.vehicle_class_grounds import class_truths
-from swarm.config.scenario import Scenario, plan_agents
+from swarm.config.scenario import Scenario, plan_agents, traffic_grid
 from swarm.config.vehicle_classes import aloft_classes
 from swarm.endpoints import listening
 from swarm.errors import BusError, ConfigError, ProtocolError, StoreError
@@ -151,7 +151,9 @@ class ChaosRun:
         self._scenario: Scenario = scenario
         terrain = build_terrain(scenario)
         self._referee = Referee(
-            class_truths(scenario, terrain, build_truth(scenario, terrain)), terrain.grid, aloft_classes(scenario)
+            class_truths(scenario, terrain, build_truth(scenario, terrain)),
+            traffic_grid(scenario, terrain.grid),
+            aloft_classes(scenario),
         )
         vehicles = [id for plan in plan_agents(scenario) for id in plan.vehicle_ids]
         self._recovery = Recovery(vehicles)

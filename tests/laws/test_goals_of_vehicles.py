@@ -34,7 +34,7 @@ class History:
         self.chance = random.Random(seed)
         self.now_ns = 1
         self.keepers = [GoalBook(), GoalBook()]
-        self.agent = GoalQueues(no_steps)
+        self.agent = GoalQueues(no_steps, GRID.middle)
         self.under_way: list[tuple[GoalBook, VehicleGoals]] = []
         self.given: dict[str, VehicleGoals] = {}
         self.visits: dict[tuple[str, int], list[int]] = {}
@@ -69,7 +69,7 @@ class History:
             self.visits.setdefault((name, goals.stamp_ns), []).append(goals.done)
 
     def start_again(self) -> None:
-        self.agent = GoalQueues(no_steps)
+        self.agent = GoalQueues(no_steps, GRID.middle)
 
     def settle(self) -> None:
         """All is heard by all."""
@@ -105,7 +105,7 @@ def test_places_are_reached_in_order_and_the_last_order_counts_whatever_is_lost_
 @pytest.mark.parametrize("seed", range(few(200)))
 def test_a_vehicle_on_a_loop_goes_on_for_ever_and_counts_no_cell_for_places_without_end(seed: int) -> None:
     chance, grid = random.Random(seed), GridSpec(5, 5, 1.0)
-    queues = GoalQueues(lambda cell: [each for _, each in grid.neighbours(cell)])
+    queues = GoalQueues(lambda cell: [each for _, each in grid.neighbours(cell)], grid.middle)
     cells = [chance.randrange(grid.cells) for _ in range(chance.randrange(1, 5))]
     queues.shared = {cell: chance.randrange(2, 8) for cell in cells if chance.random() < 0.5}
     here = chance.choice([cells[0], chance.randrange(grid.cells)])
@@ -170,7 +170,7 @@ def test_a_shared_place_has_a_cell_for_each_vehicle_within_the_fewest_steps(
 
 
 def test_each_state_of_a_vehicle_has_its_name_and_blocked_has_a_reason() -> None:
-    queues = GoalQueues(no_steps)
+    queues = GoalQueues(no_steps, GRID.middle)
     vehicle = Vehicle("a0-00", GRID, 0)
 
     def state(stopped: bool = False, left: bool = False, waits: bool = False) -> tuple[str, str]:

@@ -20,7 +20,7 @@ from launch_scripts.simulation.sample_worlds import SMALL, crowd, seeded
 from launch_scripts.simulation.simulate import Node
 from shared_map.terrain.terrain import build_terrain
 from swarm.clock import NS_PER_S
-from swarm.config.scenario import RoverConfig, added_agent
+from swarm.config.scenario import RoverConfig, added_agent, traffic_grid
 from swarm.wire.messages.orders import GiveOrder, ZoneOrder
 from swarm.wire.messages.vehicles import Obstacle, RemoveVehicles
 from swarm.wire.topics import LEAVE, OBSTACLE
@@ -89,7 +89,7 @@ class Walker:
                 self.y_m += 2 * math.cos(self.heading) * self.speed * TICK_S
         elif self.kind == "onto" and chance.random() < 0.02:  # it is put onto a vehicle, stopped or not
             if on := list(cells(world.simulation).values()):
-                self.x_m, self.y_m = world.grid.centre_m(chance.choice(on))
+                self.x_m, self.y_m = world.traffic.centre_m(chance.choice(on))
         elif self.kind == "leaps" and chance.random() < 0.05:
             self.x_m, self.y_m = world.grid.centre_m(chance.choice(world.free))
         self.seq += 1
@@ -110,9 +110,9 @@ class Walker:
 
 
 class Interplay:
-    """One seed. `broken` is what did not hold."""
+    """One seed, with `parts` cells of right of way across a cell of the terrain. `broken` is what did not hold."""
 
-    def __init__(self, seed: int, seconds: float = 27.0) -> None:
+    def __init__(self, seed: int, parts: int, seconds: float = 27.0) -> None:
         self.seed, self.seconds = seed, seconds
         self.chance = chance = random.Random(f"interplay/{seed}")
         kinds = ("small", "open", "doors", "maze")
@@ -122,7 +122,9 @@ class Interplay:
             terrain = build_terrain(scenario)
         else:
             scenario, terrain = crowd(self.kind, seed, vehicles=16, per_agent=4, side=20)
-        scenario = msgspec.structs.replace(scenario, rovers=_ROVERS)
+        side_m = terrain.grid.resolution_m / parts
+        traffic = msgspec.structs.replace(scenario.map, traffic_cell_m=side_m)
+        scenario = msgspec.structs.replace(scenario, rovers=_ROVERS, map=traffic)
         self.plan = plan = random_plan(scenario, seed, 20.0)
         self.quiet_s = quiet_s = plan.quiet_s or 18.0
         cuts = list(plan.partitions)
@@ -132,7 +134,7 @@ class Interplay:
                 cuts.append(Partition(from_s, from_s + chance.choice((0.7, 3.0)), (name,), chance.random() < 0.4))
         self.plan = plan = msgspec.structs.replace(plan, partitions=tuple(cuts))
         self.simulation = simulation = OrderedSimulation(scenario, faults=plan, terrain=terrain)
-        self.grid = terrain.grid
+        self.grid, self.traffic = terrain.grid, traffic_grid(scenario, terrain.grid)
         self.open = np.isfinite(terrain.pace_s_per_m).ravel() & np.isfinite(simulation.truth).ravel()
         self.free = [int(cell) for cell in np.flatnonzero(self.open)]
         self.broken: list[str] = []
@@ -232,6 +234,7 @@ class Interplay:
         chance, simulation = self.chance, self.simulation
         cell = chance.choice(self.free)
         around = [robot.on for robot in self.robots if robot.on is not None] + list(cells(simulation).values())
+        around = list(map(self.traffic.terrain_cell, around))
         if around and chance.random() < 0.6:
             middle = chance.choice(around)
         elif self.walkers and chance.random() < 0.5:
@@ -281,7 +284,7 @@ class Interplay:
         if not isinstance(node.service, AgentService):
             return
         service, now_s = node.service, self.simulation.now_s
-        agent = service.agent
+        agent, on = service.agent, self.traffic.terrain_cell
         pace = agent._map.pace.reshape(-1)
         known, before, closed, shut = self._before.get(node.name, (None, {}, pace, set()))
         if known is service:
@@ -291,7 +294,7 @@ class Interplay:
                         self.broken.append(
                             f"{now_s:.2f} {id} enters the map on cell {vehicle.cell}, on an obstacle"
                         )
-                    if id.startswith("extra") and id not in self._seen and np.isinf(closed[vehicle.cell]):
+                    if id.startswith("extra") and id not in self._seen and np.isinf(closed[on(vehicle.cell)]):
                         self.broken.append(f"{now_s:.2f} {id} enters the map on lethal cell {vehicle.cell}")
                     continue
                 cell, stood, at_rest = before[id]
@@ -300,14 +303,14 @@ class Interplay:
                     self.broken.append(f"{now_s:.2f} {id} is ordered to stand and drives")
                 if cell == vehicle.cell:
                     continue
-                if np.isinf(closed[vehicle.cell]) and np.isfinite(closed[cell]):
+                if np.isinf(closed[on(vehicle.cell)]) and np.isfinite(closed[on(cell)]):
                     self.broken.append(
                         f"{now_s:.2f} {id} drives from {cell} into {vehicle.cell}, lethal by its map"
                     )
         lethal = ~np.isfinite(self.simulation.truth.reshape(-1))
         for id, vehicle in agent.vehicles.items():
             towards, self._towards[id] = self._towards.get(id), vehicle.motion.entering
-            if towards is not None and towards == vehicle.motion.entering and lethal[towards]:
+            if towards is not None and towards == vehicle.motion.entering and lethal[on(towards)]:
                 self.broken.append(f"{now_s:.2f} {id} drives towards {towards}, which is lethal")
         self._seen.update(agent.vehicles)
         stopped = service._order_client.book.stopped
@@ -359,9 +362,11 @@ class Interplay:
         return found
 
 
-@pytest.mark.parametrize("seed", [4, pytest.param(9, marks=pytest.mark.thorough), 13])
-def test_no_law_breaks_whatever_joins_leaves_and_is_ordered(seed: int) -> None:
-    world = Interplay(seed)
+@pytest.mark.parametrize(
+    ("seed", "parts"), [(4, 1), pytest.param(9, 1, marks=pytest.mark.thorough), (13, 1), (4, 3), (13, 3)]
+)
+def test_no_law_breaks_whatever_joins_leaves_and_is_ordered(seed: int, parts: int) -> None:
+    world = Interplay(seed, parts)
     assert world.run() == []
     assert all(robot.moves > 0 for robot in world.robots)
     assert world.routed_after_s is not None

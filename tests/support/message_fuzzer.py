@@ -251,6 +251,8 @@ class MessageFuzzer:
         args = typing.get_args(bare)
         origin = typing.get_origin(bare) or bare
         metas = [note for note in notes if isinstance(note, msgspec.Meta)]
+        if msgspec.UnsetType in args:
+            return msgspec.UNSET if self._chance.random() < 0.3 else self._value(name, args[0])
         if NoneType in args:
             return None if self._chance.random() < 0.3 else self._value(name, args[0])
         if origin is Literal:

@@ -16,7 +16,7 @@ from launch_scripts.simulation.world.service import TargetsService
 from shared_map.terrain.terrain import Terrain, build_terrain
 from swarm.bus.bus import AskEnded, Event, Replied
 from swarm.clock import NS_PER_S
-from swarm.config.scenario import AddedAgent, Scenario, agent_of, plan_agents
+from swarm.config.scenario import AddedAgent, Scenario, agent_of, plan_agents, traffic_grid
 from swarm.config.scenario_files import parse_scenario
 from swarm.peers import ranked_id
 from swarm.right_of_way.external_session import ExternalService
@@ -144,6 +144,7 @@ class OrderedSimulation(Simulation):
 class ExternalVehicle:
     """An external vehicle that drives at random on what it is granted, among vehicles that chase targets.
 
+    cell  of the terrain, in whose middle it begins
     open  whether each cell may be entered
     on    where it is; None until it is granted a cell, and once it has left
     """
@@ -151,8 +152,9 @@ class ExternalVehicle:
     def __init__(
         self, simulation: Simulation, name: str, cell: int, chance: random.Random, open: Sequence[bool]
     ) -> None:
-        self.simulation, self.name, self.cell, self.chance, self.open = simulation, name, cell, chance, open
-        self.grid = simulation.terrain.grid
+        self.simulation, self.name, self.chance, self.open = simulation, name, chance, open
+        self.grid = traffic_grid(simulation.scenario, simulation.terrain.grid)
+        self.cell = self.grid.middle(cell)
         self.generations = MemoryGenerations()
         self.on: int | None = None
         self.moves = 0
@@ -213,4 +215,4 @@ class ExternalVehicle:
         """Called in every tick in which it is on a cell."""
 
     def near(self, cell: int) -> list[int]:
-        return [other for _, other in self.grid.neighbours(cell) if self.open[other]]
+        return [other for _, other in self.grid.neighbours(cell) if self.open[self.grid.terrain_cell(other)]]

@@ -4,9 +4,10 @@ drives it."""
 from __future__ import annotations
 
 import enum
+from array import array
 from bisect import bisect_left
 from collections.abc import Callable, Iterable, Sequence
-from itertools import pairwise
+from itertools import accumulate, groupby, pairwise
 
 import msgspec
 import numpy as np
@@ -37,7 +38,8 @@ class Follower:
     """
 
     def __init__(self) -> None:
-        self._cells: list[int] = []
+        self._cells = array("q")
+        """Not a list: a thousand routes of ten thousand cells would take a third of a GB."""
         self._at = 0
         self._turns: Sequence[int] = ()
         """For an any-angle route the indices of the cells in which it turns, its first and last included; and
@@ -59,17 +61,17 @@ class Follower:
         at = next((cells.index(cell) for cell in path if cell in cells), None)
         if at is None:
             return False
-        self._set(list(cells), at)
+        self._set(array("q", cells), at)
         self.partial = partial
         self._turns, self._turn_cells = turns, [cells[turn] for turn in turns]
         return True
 
     def drop(self) -> None:
-        self._set([], 0)
+        self._set(array("q"), 0)
         self._turns = self._turn_cells = ()
         self.partial = False
 
-    def _set(self, cells: list[int], at: int) -> None:
+    def _set(self, cells: array[int], at: int) -> None:
         self._cells, self._at, self._bounds = cells, at, None
         self.left = max(len(cells) - at - 1, 0)
         self.changes += 1
@@ -93,7 +95,7 @@ class Follower:
     def after(self, cell: int, count: int) -> list[int]:
         """The next `count` cells after a cell of the route; none if the cell is not on it."""
         index = self._find(cell)
-        return [] if index is None else self._cells[index + 1 : index + 1 + max(count, 0)]
+        return [] if index is None else self._cells[index + 1 : index + 1 + max(count, 0)].tolist()
 
     def _find(self, cell: int) -> int | None:
         """Returns the index on the route of a cell that the vehicle may enter next; None if the cell is not such a
@@ -140,12 +142,13 @@ class Follower:
 
     def near(self, count: int) -> list[int]:
         """The cell of the route that the vehicle passed last, and the next ones."""
-        return self._cells[self._at : self._at + count]
+        return self._cells[self._at : self._at + count].tolist()
 
     def ahead(self, count: int | None = None) -> list[int]:
         """The next `count` cells, or all that are left, without the one on which the vehicle is."""
         first = self._at + 1
-        return self._cells[first:] if count is None else self._cells[first : first + count]
+        last = len(self._cells) if count is None else first + count
+        return self._cells[first:last].tolist()
 
     def cut(self, passable: Callable[[Sequence[int]], int]) -> bool:
         """Ends the route before the first step ahead that is not passable; True if there is one.
@@ -167,7 +170,7 @@ _LONGEST_RETRY_NS = 3 * NS_PER_S
 STRANDED_RETRY_NS = 3 * NS_PER_S
 """Vehicles without a path ask again so soon: only a changed map gives them one."""
 PREFETCH_CELLS = 8
-"""The next part of a partial route is requested when so few cells are left."""
+"""The next part of a partial route is requested when so few cells of the terrain are left."""
 
 
 PLACES = "place:"
@@ -210,7 +213,7 @@ class Reason(enum.Enum):
 class GivenRoute(msgspec.Struct, frozen=True):
     """A route from a planner, requested or pushed.
 
-    cells          from the cell in which the planner assumed the vehicle
+    cells          of right of way, from the cell in which the planner assumed the vehicle
     cost_s         its cost, in seconds
     lower_bound_s  proven lower bound of the cost of any route
     partial        whether it ends before the target
@@ -235,7 +238,7 @@ class Vehicle:
     """State of one vehicle. Its agent drives it along `route` through `motion`, and tells it what happens.
 
     target        the target, or the name of the place, that it goes for; None before the first assignment
-    goal          the cell of that place; None of a target
+    goal          the terrain's cell of that place; None of a target
     in_reach      whether that target is within capture range
     tracked       whether that target has a living tracker; if not, `in_reach` refers to its last pose
     planner_gone  whether that target's planner is dead, since `gone_since_ns`
@@ -247,7 +250,8 @@ class Vehicle:
 
     def __init__(self, id: str, grid: GridSpec, cell: int) -> None:
         self.id = id
-        self._cols = grid.cols
+        self._grid = grid
+        self._prefetch_cells = PREFETCH_CELLS * grid.parts
         self.state = VehicleState.IDLE
         self.target: str | None = None
         self.goal: int | None = None
@@ -269,6 +273,11 @@ class Vehicle:
     @property
     def cell(self) -> int:
         return self.motion.cell
+
+    @property
+    def terrain_cell(self) -> int:
+        """The cell of the terrain in which it is."""
+        return self._grid.terrain_cell(self.motion.cell)
 
     # --- targets and planners -------------------------------------------------------------------------------
 
@@ -344,7 +353,7 @@ class Vehicle:
                 elif self.route.partial:
                     self._need = Reason.CONTINUED
                 self._settle()  # of all that the state follows from, only this changes by driving
-            elif left <= PREFETCH_CELLS and self.route.partial:
+            elif left <= self._prefetch_cells and self.route.partial:
                 self._need = Reason.CONTINUED
         if self._need is None or self.asked is not None or now_ns < self._ask_due_ns:
             return None
@@ -357,7 +366,7 @@ class Vehicle:
         """True if the vehicle chases a target and has more than `PREFETCH_CELLS` cells of route left:
         `route_request` then returns None, and need not be called."""
         goes = self.target is not None and self.goal is None and not self.in_reach and self._need is None
-        return goes and self.state is not VehicleState.STRANDED and self.route.left > PREFETCH_CELLS
+        return goes and self.state is not VehicleState.STRANDED and self.route.left > self._prefetch_cells
 
     def give_route(self, given: GivenRoute, path: Sequence[int], now_ns: int) -> Followed | None:
         """Begins the route, if it leads to the target and passes a cell of the vehicle's path. Returns what to tell
@@ -421,14 +430,16 @@ class Vehicle:
             self.state = VehicleState.FOLLOWING
         (start,) = self.route.near(1)
         before = path[: path.index(start)]
-        driven = (*before, start, *self.route.ahead())
+        cells = list(map(self._grid.terrain_cell, (*before, start, *self.route.ahead())))
+        steps = list(accumulate((tail != head for tail, head in pairwise(cells)), initial=0))
         legs = self.route.legs_ahead()
-        legs = [1] * (len(before) * bool(legs)) + legs
+        ends = list(accumulate([1] * (len(before) * bool(legs)) + legs, initial=0))
+        legs = [steps[end] - steps[begin] for begin, end in pairwise(ends) if steps[end] > steps[begin]]
         return Followed(
             vehicle=self.id,
             target=given.target if self.goal is None else _PLACE,
-            start=driven[0],
-            directions=directions_of(driven, self._cols),
+            start=cells[0],
+            directions=directions_of([cell for cell, _ in groupby(cells)], self._grid.cols // self._grid.parts),
             cost_s=given.cost_s,
             lower_bound_s=given.lower_bound_s,
             legs=pack_column(legs, "<u4"),
@@ -465,8 +476,8 @@ class Places:
     """Vehicles and their places at one instant, in one order.
 
     vehicles     in the order of all arrays
-    cells        int64 (n,), flat indices
-    regions      int64 (n,)
+    cells        int64 (n,), flat indices of cells of right of way
+    regions      int64 (n,), of the terrain
     east_m       float64 (n,), from the grid's west border
     south_m      float64 (n,), from its north border
     heading_rad  float64 (n,), clockwise from north
@@ -478,5 +489,5 @@ class Places:
         self.east_m, self.south_m = places_m(rows, grid)
         self.heading_rad: NDArray[np.float64] = rows[:, HEADING_RAD]
         self.cells: NDArray[np.int64] = rows[:, CELL].astype(np.int64)
-        row, col = np.divmod(self.cells, grid.cols)
-        self.regions: NDArray[np.int64] = row // REGION_CELLS * grid.region_cols + col // REGION_CELLS
+        (row, col), side = np.divmod(self.cells, grid.cols), REGION_CELLS * grid.parts
+        self.regions: NDArray[np.int64] = row // side * -(-grid.cols // side) + col // side

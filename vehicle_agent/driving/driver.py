@@ -77,7 +77,8 @@ class Driver:
                 self._left.append((vehicle, left_s))
             if self.dynamics is None and not (motion := vehicle.motion).at_rest:
                 by = motion.cell if self.pulled else motion.head
-                motion.roll_on(by, self._climbing(motion), counts=by == motion.head)
+                at = motion.grid.terrain_cell(by)
+                motion.roll_on(at, self._climbing(motion), counts=by == motion.head)
 
     def _drive(self, vehicle: Vehicle, left_s: float, stopped: Callable[[str], bool]) -> float:
         """Drives one vehicle to its next cell at most. Returns the seconds that it has left then."""
@@ -91,14 +92,15 @@ class Driver:
                 # With dynamics of its own a vehicle could not stop at the border.
                 if waits or not (self.dynamics is None or self.holdings.may_enter(vehicle.id, path[1])):
                     return 0.0
-                motion.set_out(path[1], vehicle.route.point(path[1], self.local_map.grid.cols))
+                motion.set_out(path[1], vehicle.route.point(path[1], motion.grid.cols))
                 if self.measures:
                     motion.row[DRIVEN_S] = 0.0
             before = motion.cell
             had_s, head, measured_s = left_s, motion.head, motion.row.item(DRIVEN_S)
             length_m = motion.length_m - motion.border_m if self.pulled else motion.length_m
             climbing = self._climbing(motion)
-            pace_s_per_m = self._physics.item(before if self.pulled else head) * climbing
+            at = motion.grid.terrain_cell(before if self.pulled else head)
+            pace_s_per_m = self._physics.item(at) * climbing
             if self.dynamics is None:
                 entering = motion.entering
                 enters = entering is None or self.holdings.may_enter(vehicle.id, entering)
@@ -108,7 +110,7 @@ class Driver:
                     return left_s  # in this tick another of ours may leave yet
             else:
                 path = self.holdings.open(vehicle.id)[: self.holdings.keeps + 1]
-                passes = partial(vehicle.route.point, cols=self.local_map.grid.cols)
+                passes = partial(vehicle.route.point, cols=motion.grid.cols)
                 left_s = self.dynamics.advance(vehicle.id, motion, path, left_s, pace_s_per_m, passes)
                 if self.dynamics.slowed:  # by itself, not by the ground
                     measured_s = math.nan
@@ -117,7 +119,7 @@ class Driver:
                 if not motion.at_rest:
                     motion.row[DRIVEN_S] = measured_s
                 elif not math.isnan(measured_s):
-                    self.driven.append((head, measured_s / (length_m * climbing)))
+                    self.driven.append((motion.grid.terrain_cell(head), measured_s / (length_m * climbing)))
             cell = motion.cell
             if cell != before:
                 self.holdings.moved(vehicle.id, cell)
@@ -169,7 +171,8 @@ def climbing_of(motion: Motion, climb: Climb, pulled: bool) -> float:
 
     pulled  whether it leads along a segment, in any direction
     """
+    tail, head = motion.grid.terrain_step(motion.tail, motion.head)
     if not pulled:
-        return climb.driven(motion.tail, motion.head)
+        return climb.driven(tail, head)
     south, east = (motion.row[TO_ROW : TO_COL + 1] - motion.row[ROW : COL + 1]).tolist()
-    return climb.flown(motion.tail, motion.head, motion.length_m, south, east)
+    return climb.flown(tail, head, motion.length_m * motion.grid.parts, south, east)

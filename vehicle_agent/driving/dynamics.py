@@ -27,6 +27,7 @@ class DynamicsWorld:
     """Arguments with which dynamics are made.
 
     agent  id of the agent whose vehicles they drive
+    grid   the cells of right of way
     seed   of the run
     """
 

@@ -24,8 +24,9 @@ Stop = tuple[int, Point]
 """Beginning or end of a step: a cell, and a point in it."""
 Rows = NDArray[np.float64]
 """A row for each motion, with these columns. Its stretch leads from (ROW, COL) straight to (TO_ROW, TO_COL), and
-begins after SINCE_M of its step. It rolls up to UNTIL_M, at FACTOR times the pace of cell BY; up to 0: never.
-The share COUNTS of the seconds that it drives is added to DRIVEN_S; that is NaN of a step which is not measured."""
+begins after SINCE_M of its step. It rolls up to UNTIL_M, at FACTOR times the pace of BY, a cell of the terrain; up
+to 0: never. The share COUNTS of the seconds that it drives is added to DRIVEN_S; that is NaN of a step which is not
+measured."""
 (DONE_M, UNTIL_M, BY, FACTOR, COUNTS, CELL, HEADING_RAD, ROW, COL, TO_ROW, TO_COL, SINCE_M, LENGTH_M) = range(13)
 DRIVEN_S = 13
 """Column behind those above, which a new step leaves as it is."""
@@ -39,6 +40,7 @@ class Motion:
     The vehicle is a point. It occupies `tail` up to their border, or the corner that they share, and `head` from
     there on.
 
+    grid         cells of right of way
     cell         the one cell that the vehicle occupies
     at_rest      whether it stands where a step ends, so that it may set out in any direction
     length_m     metres of the step; 0 at rest
@@ -48,7 +50,7 @@ class Motion:
     """
 
     def __init__(self, grid: GridSpec, cell: int) -> None:
-        self._grid = grid
+        self.grid = grid
         self.heading_rad = 0.0
         self.row: Rows = np.zeros(_COLUMNS)
         self.head, self._to = cell, middle_of(grid, cell)
@@ -74,7 +76,7 @@ class Motion:
         self.row[:DRIVEN_S] = (done_m, 0, 0, 1, 0, self.cell, self.heading_rad, *begin, *end, since_m, length_m)
 
     def roll_on(self, by: int, factor: float, *, counts: bool) -> None:
-        """Makes it roll along its stretch from now on, at `factor` times the pace of cell `by`.
+        """Makes it roll along its stretch from now on, at `factor` times the pace of the terrain's cell `by`.
 
         counts  whether the time counts as driven, if the step is measured
         """
@@ -106,12 +108,12 @@ class Motion:
 
         to  the point inside that cell where the step ends, as row and col; None is its middle
         """
-        rows = cell // self._grid.cols - self.head // self._grid.cols
-        cols = cell % self._grid.cols - self.head % self._grid.cols
+        rows = cell // self.grid.cols - self.head // self.grid.cols
+        cols = cell % self.grid.cols - self.head % self.grid.cols
         if not self.at_rest or max(abs(rows), abs(cols)) != 1:
             raise ValueError(f"no step from cell {self.head} to {cell}")
-        self._to = middle_of(self._grid, cell) if to is None else to
-        way = way_of(self._grid, (self.head, self._at), (cell, self._to))
+        self._to = middle_of(self.grid, cell) if to is None else to
+        way = way_of(self.grid, (self.head, self._at), (cell, self._to))
         self._via, self.border_m, self.length_m = way.via, way.border_m, way.length_m
         self.head = cell
         self.at_rest = False
@@ -155,7 +157,7 @@ class Motion:
 
     def place_m(self) -> tuple[float, float]:
         """(east, south) in metres from the north-west corner of the grid."""
-        east_m, south_m = places_m(self.row[None], self._grid)
+        east_m, south_m = places_m(self.row[None], self.grid)
         return east_m.item(), south_m.item()
 
 
@@ -175,7 +177,7 @@ def together(motions: Sequence[Motion]) -> Rows:
 def roll(rows: Rows, paces: NDArray[np.floating], seconds: float) -> NDArray[np.bool_]:
     """Drives the vehicles that reach no end of a stretch in this time; returns which.
 
-    paces  s/m, by cell
+    paces  s/m, by cell of the terrain
     """
     done_m = rows[:, DONE_M] + seconds / (paces[rows[:, BY].astype(np.intp)] * rows[:, FACTOR])
     rolls: NDArray[np.bool_] = done_m < rows[:, UNTIL_M]

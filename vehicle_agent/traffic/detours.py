@@ -37,7 +37,8 @@ _DIAGONAL = math.sqrt(2.0)
 class Detours:
     """Leads vehicles around standing obstacles.
 
-    pace   float32 (rows, cols), s/m; inf is lethal
+    grid   cells of right of way
+    pace   float32 (rows, cols) of the terrain, s/m; inf is lethal
     steps  the neighbours of a cell to which one may drive: not lethal, not closed, not too steep
     climb  factor of a step's cost by its slope; None if steps cost the same both ways
 
@@ -116,7 +117,7 @@ class Detours:
         if not goals:
             return
         lowest = 1.0 if self.climb is None else self.climb.lowest
-        least = float(self._pace[behind].min()) * self.grid.resolution_m * lowest
+        least = float(self._pace[self.grid.terrain_cell(np.array(behind))].min()) * self.grid.resolution_m * lowest
         end_row, end_col = divmod(behind[-1], self.grid.cols)
 
         def bound_s(cell: int) -> float:
@@ -150,5 +151,6 @@ class Detours:
 
     def _step_s(self, tail: int, head: int) -> float:
         straight = abs(head - tail) in (1, self.grid.cols)
-        level_s = float(self._pace[head]) * self.grid.resolution_m * (1.0 if straight else _DIAGONAL)
-        return level_s if self.climb is None else level_s * self.climb.of_step(tail, head)
+        pace = self._pace.item(self.grid.terrain_cell(head))
+        level_s = pace * self.grid.resolution_m * (1.0 if straight else _DIAGONAL)
+        return level_s if self.climb is None else level_s * self.climb.driven(*self.grid.terrain_step(tail, head))

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from shared_map.terrain.slope_and_climb import Climb
 from swarm.clock import NS_PER_S
 from swarm.config.scenario import PlannerConfig
-from swarm.grid import GridSpec, Window
+from swarm.grid import STEP_COL, STEP_ROW, GridSpec, Window
 from swarm.right_of_way.cell_orders import cells_beside
 from swarm.right_of_way.holdings import CellRequest, Holdings
 from vehicle_agent.agent_maps import meet
@@ -51,14 +51,16 @@ class Steering:
     A planner's route is the cost-to-go along one line. A cell beside it costs the step back to the route and the
     rest from there; so a host needs no tree of the planner, and one that is pushed aside finds back by itself.
 
-    pace       float32 (rows, cols), s/m; inf is lethal; read at each call
+    grid       cells of right of way
+    pace       float32 (rows, cols) of the terrain, s/m; inf is lethal; read at each call
     reserve    cells ahead of itself that a vehicle keeps though others wait for them
     obstacles  vehicles without right of way: no step leads onto their cells, but routes may lead over them
     climb      says which steps are too steep; None if none is
 
     waiting_ns   vehicle -> the cell on which it waits, and since when; deleted when it may go on
     shut_in      vehicles that have stood for long on cells from which obstacles leave no step
-    ways_out     cell that only an operator's zone closes -> steps from there out of it: a vehicle there leaves
+    ways_out     cell of the terrain that only an operator's zone closes -> steps from there out of it: a vehicle
+                 there leaves
     """
 
     grid: GridSpec
@@ -77,14 +79,23 @@ class Steering:
 
     def closed(self, cell: int) -> bool:
         """Returns True if a cell is lethal, or an obstacle closes it."""
-        return cell in self._shut or not math.isfinite(self._pace.item(cell))
+        return cell in self._shut or not math.isfinite(self._pace.item(self.grid.terrain_cell(cell)))
+
+    def must_leave(self, cell: int) -> bool:
+        """Returns True if a cell is in a zone that a vehicle leaves."""
+        return bool(self.ways_out) and self.grid.terrain_cell(cell) in self.ways_out
+
+    def _allows(self, tail: int, head: int) -> bool:
+        """Returns True if a step is not too steep. Steepness counts where it leads into another terrain cell."""
+        terrain_cell = self.grid.terrain_cell
+        return self.climb is None or self.climb.allows(terrain_cell(tail), terrain_cell(head))
 
     def passable(self, tail: int, head: int) -> bool:
         """Returns True if the map allows the step between two neighbours; a diagonal also needs the cells beside
         it."""
-        if tail in self.ways_out:
+        if self.must_leave(tail):
             return head in self._out_of(tail)
-        if self.closed(head) or not (self.climb is None or self.climb.allows(tail, head)):
+        if self.closed(head) or not self._allows(tail, head):
             return False
         return not self._cuts_corner(tail, head)
 
@@ -101,19 +112,20 @@ class Steering:
         gone before the vehicle is there."""
         if len(cells) < 2:
             return 0
-        at = np.array(cells, np.int64)
+        at, terrain_cell = np.array(cells, np.int64), self.grid.terrain_cell
         tails, heads = at[:-1], at[1:]
-        lethal = np.isinf(self._pace[heads])
+        lethal = np.isinf(self._pace[terrain_cell(heads)])
         if not self.planner.corner_cutting:
             cols = at % self.grid.cols
             east = cols[1:] - cols[:-1]
             # Beside a straight step are its own two cells. Leaving a lethal cell matters to diagonals only; for all
             # steps but the first it is the head of the previous one, which ends the route there anyway.
-            beside = np.isinf(self._pace[tails + east]) | np.isinf(self._pace[heads - east])
+            beside = np.isinf(self._pace[terrain_cell(tails + east)])
+            beside |= np.isinf(self._pace[terrain_cell(heads - east)])
             beside[0] &= cols[0] != cols[1] and cells[0] // self.grid.cols != cells[1] // self.grid.cols
             lethal |= beside
         if self.climb is not None:
-            lethal |= np.isinf(self.climb.along(tails, heads))
+            lethal |= np.isinf(self.climb.along(terrain_cell(tails), terrain_cell(heads)))
         first = int(lethal.argmax())
         return first if lethal[first] else len(cells) - 1
 
@@ -138,7 +150,7 @@ class Steering:
         """
         here, still = path[0], len(path) == 1
         age_ms = max(1, min(age_ms, _OLDEST_MS), pushed_ms)
-        if here in self.ways_out:
+        if self.must_leave(here):
             wants = sorted(self.steps(here) if still else (), key=held.__contains__)
             return CellRequest((), wants, len(wants), age_ms)
         if vehicle.in_reach or vehicle.target is None:
@@ -215,15 +227,22 @@ class Steering:
         return ahead
 
     def _out_of(self, cell: int) -> list[int]:
-        """The neighbours straight beside a cell in a zone that are nearer to its border, or open."""
-        depth = self.ways_out[cell]
-        beside = [neighbour for direction, neighbour in self.grid.neighbours(cell) if direction % 2 == 0]
-        outwards = [each for each in beside if not self.closed(each) or self.ways_out.get(each, depth) < depth]
-        return [each for each in outwards if each not in self._shut]
+        """The neighbours straight beside a cell in a zone in whose directions the next cell of the terrain is
+        nearer to its border, or open."""
+        grid, out = self.grid, []
+        (row, col), depth = grid.row_col(cell), self.ways_out[grid.terrain_cell(cell)]
+        for direction, step in grid.neighbours(cell):
+            south, east = grid.parts * STEP_ROW[direction], grid.parts * STEP_COL[direction]
+            if direction % 2 or step in self._shut or not grid.inside(row + south, col + east):
+                continue
+            beside = grid.terrain_cell(cell + south * grid.cols + east)
+            if math.isfinite(self._pace.item(beside)) or self.ways_out.get(beside, depth) < depth:
+                out.append(step)
+        return out
 
     def steps(self, cell: int) -> list[int]:
         """The neighbours that the map allows to drive to."""
-        if cell in self.ways_out:
+        if self.must_leave(cell):
             return self._out_of(cell)
         around = [each for direction, each in self.grid.neighbours(cell) if self._diagonal or direction % 2 == 0]
         return [each for each in around if self.passable(cell, each)]
@@ -231,7 +250,7 @@ class Steering:
     def _is_one_way(self, tail: int, head: int) -> bool:
         """Returns True if a step between neighbours could not be reversed, as it is too steep the other way: it may
         lead into a dead end."""
-        return self.climb is not None and not self.climb.allows(head, tail)
+        return not self._allows(head, tail)
 
     def _costs(
         self, here: int, stays: float, route: Sequence[tuple[int, int, int, float]]
@@ -268,8 +287,7 @@ class Steering:
                 return rest
             south, east = abs(row - there_row), abs(col - there_col)
             apart = south + _DIAGONAL * east if south > east else east + _DIAGONAL * south
-            beside = apart < 2.0 and (self.climb is None or self.climb.allows(cell, there))
-            beside = beside and not self._cuts_corner(cell, there)
+            beside = apart < 2.0 and self._allows(cell, there) and not self._cuts_corner(cell, there)
             cost = rest + apart if beside else rest + _OFF_ROUTE + 2.0 * apart
             if cost < best:
                 best = cost
@@ -328,7 +346,7 @@ class CellRequests:
         self.steering.forget(vehicle)
 
     def ground_changed(self, windows: Iterable[Window]) -> None:
-        """The ground has changed in these windows."""
+        """The ground has changed in these windows of cells of right of way."""
         self._changed += windows
 
     def make_anew(self) -> None:
@@ -353,7 +371,7 @@ class CellRequests:
         held = holdings.occupied()
         changed = held ^ self._held
         self._held = held
-        ways_out, known, beside = steering.ways_out, self._made_of, self._beside
+        known, beside = self._made_of, self._beside
         paths, pushed, since_all_ns = holdings.paths, holdings.pushed, self._since_ns
         for vehicle in vehicles:
             id, target, near = vehicle.id, vehicle.target, vehicle.in_reach
@@ -366,7 +384,7 @@ class CellRequests:
             same = kept is not None and kept[0] == made_of and kept[1] <= now_ns < kept[2]
             if same and (not still or changed.isdisjoint(beside[id])):
                 continue
-            idle = (near or target is None) and path[0] not in ways_out
+            idle = (near or target is None) and not steering.must_leave(path[0])
             turn_ns = _WAITING_TURN_NS if still and not idle else _TURN_NS
             phase_ns = crc32(id.encode()) % 4000 * (_TURN_NS // 4000)
             turn = (now_ns + phase_ns) // turn_ns

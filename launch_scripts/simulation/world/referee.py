@@ -52,6 +52,7 @@ class Broken:
     count     a key of `ALARMS`: vehicles that met, that drove into an obstacle which had closed the cell in time,
               that an obstacle hit by its own fault, or that entered a lethal cell
     vehicles  one, or two with a blank between them
+    cell      of the terrain
     found     the finding in words
     evidence  the stays which prove it
     """
@@ -135,6 +136,7 @@ class Referee:
     """Turns reports into broken laws. Repeated and late reports change nothing.
 
     truths  class of vehicles -> float32 (rows, cols), s/m; inf is lethal. One that is not there is as "ground"
+    grid    the cells of right of way
     aloft   classes that fly: they meet each other, and nothing that drives
     """
 
@@ -144,7 +146,7 @@ class Referee:
         self._aloft = frozenset(aloft)
         self._air = Referee(truths, grid) if aloft else None
         self._truths = {name: truth.reshape(-1) for name, truth in truths.items()}
-        self._cells = grid.cells
+        self._grid, self._cells = grid, grid.cells
         self._vehicles: dict[str, Stay] = {}
         """Vehicle -> where it is: its newest stay, which ends with its newest report."""
         self._stays: dict[int, list[Stay]] = {}
@@ -156,8 +158,8 @@ class Referee:
 
     @property
     def cells(self) -> NDArray[np.int64]:
-        """Last known cell of every vehicle."""
-        own = np.array([stay.cell for stay in self._vehicles.values()], np.int64)
+        """Last known cell of the terrain of every vehicle."""
+        own = self._grid.terrain_cell(np.array([stay.cell for stay in self._vehicles.values()], np.int64))
         return own if self._air is None else np.concatenate((own, self._air.cells))
 
     def hear_obstacle(self, obstacle: Obstacle, now_ns: int) -> None:
@@ -210,8 +212,9 @@ class Referee:
             self._left.append(left)
         self._vehicles[id] = entered
         truth = self._truths.get(fleet.vehicle_class, self._truths[GROUND])
-        if not truth.item(cell) < math.inf:
-            yield Broken("lethal_entries", id, cell, stamp_ns, f"{id} entered a lethal cell", (replace(entered),))
+        on = self._grid.terrain_cell(cell)
+        if not truth.item(on) < math.inf:
+            yield Broken("lethal_entries", id, on, stamp_ns, f"{id} entered a lethal cell", (replace(entered),))
 
     def _met(self, stay: Stay) -> Iterator[Broken]:
         """The laws that a vehicle's stay on a cell proves broken, by an obstacle or another vehicle there."""
@@ -219,7 +222,8 @@ class Referee:
         for other, until_ns in _meetings(stay, self._stays[stay.cell], self._encounters, _SKEW_NS):
             first, second = sorted((stay, other), key=lambda each: each.who)
             evidence, said = (replace(first), replace(second)), f"{first.who} and {second.who} on one cell"
-            yield Broken("collisions", f"{first.who} {second.who}", stay.cell, until_ns, said, evidence)
+            on = self._grid.terrain_cell(stay.cell)
+            yield Broken("collisions", f"{first.who} {second.who}", on, until_ns, said, evidence)
 
     def _sweep(self, now_ns: int) -> None:
         """Forgets stays that ended long ago. A vehicle's last stay is kept: it still stands there."""
@@ -312,7 +316,8 @@ class ObstacleReferee:
                 found = f"{obstacle} drove into {vehicle}, which was there first"
             else:
                 found = f"{obstacle} met {vehicle} {closed_s:.2f} s after its first report"
-            yield Broken(count, vehicle, stay.cell, until_ns, found, (replace(stay), replace(cover)))
+            on = self._grid.terrain_cell(stay.cell)
+            yield Broken(count, vehicle, on, until_ns, found, (replace(stay), replace(cover)))
 
     def _sweep(self, now_ns: int) -> None:
         """Forgets what ended long ago."""

@@ -23,7 +23,7 @@ from shared_map.terrain.terrain import Terrain
 from shared_map.vehicle_class_grounds import class_truths
 from swarm.clock import NS_PER_S
 from swarm.config.plugin_names import walk_named_by
-from swarm.config.scenario import Scenario, TargetConfig, ids_of
+from swarm.config.scenario import Scenario, TargetConfig, ids_of, traffic_grid
 from swarm.config.vehicle_classes import aloft_classes
 from swarm.errors import ConfigError
 from swarm.places import cell_of, written
@@ -120,10 +120,9 @@ class TargetWorld:
         # Few cells, so that most pages of the truth stay shared.
         pace[terrain.lethal & np.isfinite(pace)] = np.inf
         self._terrain = walks.TrueTerrain(terrain.grid, pace, terrain.climb, None if halves else homes)
-        self._referee = Referee(
-            class_truths(scenario, terrain, truth_s_per_m), terrain.grid, aloft_classes(scenario)
-        )
-        self._target_obstacles = TargetObstacles(scenario, terrain.grid)
+        traffic = traffic_grid(scenario, terrain.grid)
+        self._referee = Referee(class_truths(scenario, terrain, truth_s_per_m), traffic, aloft_classes(scenario))
+        self._target_obstacles = TargetObstacles(scenario, traffic)
         self._rovers = Rovers(scenario, self._terrain, incarnation)
         self._own_incarnation = self._incarnation = incarnation
         # Trackers of external targets, and for a standby the leader; and the highest incarnation of a leader.

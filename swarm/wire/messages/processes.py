@@ -7,9 +7,12 @@ from typing import Annotated
 import msgspec
 from msgspec import Meta
 
-from swarm.grid import REGION_CELLS
+from swarm.grid import MOST_SHARD_REGIONS, REGION_CELLS
 from swarm.wire import fields
 from swarm.wire.messages import Message, schema_of
+
+TrafficParts = Annotated[int, Meta(ge=1, le=MOST_SHARD_REGIONS)]
+"""Cells of right of way across a cell of the terrain."""
 
 
 class RunInfo(Message, frozen=True, kw_only=True, tag=schema_of("run")):
@@ -25,6 +28,8 @@ class RunInfo(Message, frozen=True, kw_only=True, tag=schema_of("run")):
     restarts         in this run
     classes          of vehicles beside "ground", in the order of their numbers
     shard_cells      side of a shard: two layouts in one run would grant a cell twice
+    traffic_parts    cells of right of way across a cell of the grid, 1 if absent. The cells in messages about right
+                     of way, and in `Fleet`, are numbered in the finer grid
     """
 
     run_id: fields.Word
@@ -47,6 +52,7 @@ class RunInfo(Message, frozen=True, kw_only=True, tag=schema_of("run")):
     classes: Annotated[list[fields.Id], fields.IDS] = []
     wire_version: fields.Count = 8
     shard_cells: fields.Count = REGION_CELLS
+    traffic_parts: TrafficParts | msgspec.UnsetType = msgspec.UNSET
 
     @property
     def plans_to_places(self) -> bool:

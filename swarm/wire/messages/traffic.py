@@ -339,10 +339,12 @@ class Claim(Message, frozen=True, kw_only=True, tag=schema_of("claim")):
 
 class KnownRequest(Message, frozen=True, kw_only=True, tag=schema_of("known-request")):
     """A new generation of an agent or an external vehicle asks all agents what they know of it. Agents with shards
-    of another size do not answer an agent.
+    or cells of another size do not answer.
 
-    disk   its file; 0 of an external vehicle
-    layer  0 ground, 1 air: only agents of this layer answer
+    disk         its file; 0 of an external vehicle
+    layer        0 ground, 1 air: only agents of this layer answer
+    shard_cells  of an external vehicle the cells of right of way across a region: 256 for each across a cell of the
+                 terrain
     """
 
     agent: fields.Id

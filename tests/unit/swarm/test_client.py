@@ -153,6 +153,33 @@ def test_who_clips_a_cell_beside_a_diagonal_step_keeps_the_cell_that_it_drives_i
         assert way.wanted == [way.cells[0], *ahead]
 
 
+class Granting(OnAStep):
+    """Right of way of a vehicle that stands where it says, and is granted all that it wants."""
+
+    def counted(self, cell: int, x_m: float, y_m: float) -> int:
+        return cell
+
+    @property
+    def cells(self) -> tuple[int, ...]:  # type: ignore[override]
+        return tuple(self.wanted)
+
+
+def test_a_vehicle_reserves_cells_of_right_of_way_along_a_route_over_larger_cells(world: Swarm) -> None:
+    program = Program(world).swarm
+    frame, rover = program.frame, program.vehicle("rover")
+    frame.traffic = traffic = GRID.traffic(3)
+    rover.give_way(Granting())  # type: ignore[arg-type]
+    beside = traffic.middle(GRID.cell(5, 5)) + 1
+    rover.at(*traffic.centre_m(beside))
+    assert (rover.cell, rover.traffic_cell) == (GRID.cell(5, 5), beside)
+    cells = rover.cells_of(Route(frame, "t0", "ok", (GRID.cell(5, 5), GRID.cell(5, 6)), 1.0, 1.0, 0.0))
+    assert cells == [beside, beside + 1, beside + 2]
+    assert cells[-1] == traffic.middle(GRID.cell(5, 6))
+    assert rover.reserve(cells[1:]) == cells[1:]
+    with pytest.raises(ConfigError, match="outside the terrain"):
+        rover.reserve([traffic.cells])
+
+
 def test_one_program_has_each_vehicle_and_target_once_at_a_time(program: Program) -> None:
     for make in (program.swarm.vehicle, program.swarm.target):
         first: Any = make("one")

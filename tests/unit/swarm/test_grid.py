@@ -1,7 +1,7 @@
 """Cells, metres, tiles, regions and windows agree with each other on any grid."""
 
 import math
-from itertools import product
+from itertools import pairwise, product
 from typing import Any
 
 import numpy as np
@@ -10,7 +10,19 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from swarm.errors import OutsideGridError
-from swarm.grid import REGION_TILES, STEP_COL, STEP_ROW, TILE_CELLS, GridSpec, Window, bounds_of, walk
+from swarm.grid import (
+    REGION_TILES,
+    STEP_COL,
+    STEP_ROW,
+    TILE_CELLS,
+    GridSpec,
+    Window,
+    bounds_of,
+    crossed,
+    joined,
+    refined,
+    walk,
+)
 
 sizes = st.integers(1, 700)
 grids = st.builds(
@@ -134,3 +146,68 @@ def test_a_cell_is_whole_numbers(half: Any) -> None:
         with pytest.raises(TypeError):
             ask()
     assert grid.row_col(grid.cell(np.int64(2), np.uint8(3))) == (2, 3)
+
+
+ODD = st.sampled_from([1, 3, 5, 15])
+small = st.builds(GridSpec, rows=st.integers(1, 12), cols=st.integers(1, 12), resolution_m=st.just(30.0))
+
+
+@given(small, ODD, st.data())
+def test_each_cell_of_right_of_way_is_in_the_cell_of_the_terrain_at_its_place(terrain, parts, data):
+    traffic = terrain.traffic(parts)
+    cell = data.draw(st.integers(0, traffic.cells - 1))
+    assert traffic.terrain_cell(cell) == terrain.cell_at(*traffic.centre_m(cell))
+    on = traffic.terrain_cell(cell)
+    assert traffic.centre_m(traffic.middle(on)) == pytest.approx(terrain.centre_m(on))
+    cells = np.arange(traffic.cells)
+    assert traffic.terrain_cell(cells).tolist() == list(map(traffic.terrain_cell, cells.tolist()))
+    assert np.bincount(traffic.terrain_cell(cells)).tolist() == [parts * parts] * terrain.cells
+    assert (traffic == terrain) == (parts == 1)
+
+
+@given(small, ODD, st.data())
+def test_a_route_is_refined_into_steps_which_are_parts_of_its_own(terrain, parts, data):
+    traffic = terrain.traffic(parts)
+    cells = [data.draw(st.integers(0, terrain.cells - 1))]
+    for _ in range(data.draw(st.integers(0, 6))):
+        near = [cell for _, cell in terrain.neighbours(cells[-1])]
+        cells += near and [data.draw(st.sampled_from(near))]
+    fine, turns = refined(traffic, cells)
+    assert len(fine) == (len(cells) - 1) * parts + 1
+    assert fine[::parts] == list(map(traffic.middle, cells))
+    assert not turns
+    for number, (tail, head) in enumerate(pairwise(fine)):
+        assert traffic.distance_cells(tail, head) == 1
+        step = cells[number // parts], cells[number // parts + 1]
+        assert traffic.terrain_step(tail, head) == step
+        assert {traffic.terrain_cell(tail), traffic.terrain_cell(head)} <= set(step)
+
+
+@given(small, ODD, st.data())
+def test_a_vehicle_anywhere_in_a_cell_of_a_route_joins_it_without_leaving_that_cell(terrain, parts, data):
+    traffic = terrain.traffic(parts)
+    start = data.draw(st.integers(0, traffic.cells - 1))
+    cells = [traffic.terrain_cell(start)]
+    cells += data.draw(st.permutations([cell for _, cell in terrain.neighbours(cells[0])]))[:1]
+    fine, _ = joined(traffic, cells, (), [start])
+    assert fine[fine.index(start)] == start
+    assert fine[-1] == traffic.middle(cells[-1])
+    assert all(traffic.distance_cells(tail, head) == 1 for tail, head in pairwise(fine))
+    assert set(map(traffic.terrain_cell, fine)) == set(cells)
+
+
+@given(small, ODD, st.data())
+def test_a_line_crosses_the_cells_on_which_it_lies(terrain, parts, data):
+    traffic = terrain.traffic(parts)
+    cell = st.integers(0, traffic.cells - 1)
+    start, end = data.draw(cell), data.draw(cell)
+    found = crossed(traffic, start, end)
+    assert (found[0], found[-1]) == (start, end)
+    assert all(traffic.distance_cells(tail, head) == 1 for tail, head in pairwise(found))
+    (x0, y0), (x1, y1) = traffic.centre_m(start), traffic.centre_m(end)
+    # Points of the line, few of which lie on a border.
+    shares = np.linspace(0.0, 1.0, 487)
+    on = {traffic.cell_at(x0 + share * (x1 - x0), y0 + share * (y1 - y0)) for share in shares.tolist()}
+    beside = {each for cell in found for _, each in traffic.neighbours(cell)} | set(found)
+    assert on <= beside
+    assert len(on - set(found)) <= sum(1 for tail, head in pairwise(found) if abs(head - tail) > 1)

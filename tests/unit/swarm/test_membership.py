@@ -86,6 +86,10 @@ def test_members_of_one_run_get_along(members, world):
             "planner t1 has shards of right of way of 1024 cells a side, but planner t0 has 256: map.shard",
         ),
         (
+            {"traffic_parts": 3},
+            "planner t1 has 3 cells of right of way across a cell of the terrain, but planner t0 has 1: map.",
+        ),
+        (
             {"classes": ["truck", "walker"]},
             "planner t1 has the classes of vehicles truck, walker, but planner t0 has none: marks name classes by",
         ),

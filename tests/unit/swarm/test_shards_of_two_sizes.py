@@ -132,3 +132,13 @@ def test_an_agent_tells_an_external_vehicle_of_larger_shards_only_if_the_run_has
         rights = RightOfWay("a0", Shards(GRID, list(spawns), LARGE), spawns, own, {})
         known = rights.answer_known(asked)
         assert [(each.agents, each.shard_cells) for each in known] == [(list(spawns), LARGE)] * answers
+
+
+def test_an_external_vehicle_that_takes_cells_for_larger_ones_gets_no_answer() -> None:
+    spawns = {f"a{n}": {f"a{n}-00": n} for n in range(3)}
+    for parts in (1, 3):
+        shards = Shards(GRID.traffic(parts), list(spawns), parts * REGION_CELLS)
+        rights = RightOfWay("a0", shards, spawns, OwnRecord(disk=1), {})
+        for stated in (1, 3):
+            asked = KnownRequest(agent="rover", disk=0, shard_cells=stated * REGION_CELLS)
+            assert bool(rights.answer_known(asked)) == (stated == parts)
