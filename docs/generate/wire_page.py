@@ -143,8 +143,7 @@ def type_text(hint: Any) -> str:
     if origin is Annotated:
         return _bounded(*taken_apart(hint))
     if origin in (types.UnionType, typing.Union):
-        given = [arg for arg in args if arg is not msgspec.UnsetType]
-        return "|".join("nil" if arg is type(None) else type_text(arg) for arg in given)
+        return "|".join(type_text(arg) for arg in args if arg is not msgspec.UnsetType)
     if origin is typing.Literal:
         return "|".join(map(repr, args))
     if origin is list:
@@ -153,7 +152,7 @@ def type_text(hint: Any) -> str:
         return f"({', '.join(type_text(arg) for arg in args)})"
     if origin is dict:
         return f"{{{type_text(args[0])}: {type_text(args[1])}}}"
-    return str(hint.__name__)
+    return "nil" if hint is type(None) else str(hint.__name__)
 
 
 def _bounded(bare: Any, notes: tuple[Any, ...]) -> str:
