@@ -451,7 +451,9 @@ def verdict(report: Mapping[str, Any], failures: Sequence[str] = ()) -> str:
     overload = [f"overloaded machine, {late:.0%} of ticks were late"] if late > _LATE_SHARE else []
     wrong = list(dict.fromkeys([*overload, *failures, *forbidden, *serious, *left_behind(report)]))
     more = f"; and {len(wrong) - _FAULTS} more" if len(wrong) > _FAULTS else ""
-    how = f"Not all went well: {'; '.join(wrong[:_FAULTS])}{more}." if wrong else WELL
+    restarts = report.get("restarts")
+    well = f"{WELL}, with {number_of(restarts, 'restart')}." if restarts else f"{WELL}."
+    how = f"Not all went well: {'; '.join(wrong[:_FAULTS])}{more}." if wrong else well
     return f"{', '.join(reached)}. {how}"
 
 
@@ -459,4 +461,4 @@ _FAULTS = 3
 """Most faults that a verdict names."""
 _LATE_SHARE = 0.2
 """Share of late ticks from which on a run is overloaded, as in the alert `SwarmTicksLate`."""
-WELL = "All went well."
+WELL = "All went well"
