@@ -120,7 +120,8 @@ def test_a_second_run_in_the_background_is_ended_by_its_name(live: LiveSwarm, tm
     assert "stopping" in told.stdout
     states = {each["run"]: each["state"] for each in json.loads(swarm("ps", "-a", "--json").stdout)}
     assert (states[first], states[second]) == ("running", "ended")
-    assert "does not run here; `swarm ps` lists those which do" in swarm("down", second).stderr
+    over = f"swarm: run {second} does not run in {tmp_path / second}; `swarm ps` lists those which do\n"
+    assert swarm("down", second).stderr == over
 
 
 def test_a_start_in_the_background_that_is_asked_to_end_leaves_no_run(live: LiveSwarm, tmp_path: Path) -> None:
