@@ -73,14 +73,14 @@ class Puller:
         longest = int(np.diff(ends, prepend=0).max(initial=0)) + 1
         scratch = (np.empty(longest, np.int64), np.empty((2, longest)), *np.empty((2, longest), np.int64))
         out = np.empty(2 * steps, np.uint8), np.empty(many, np.int64)
-        legs, turned = np.empty(2 * steps, np.uint32), np.empty(1, np.int64)
+        legs, turns = np.empty(2 * steps, np.uint32), np.empty(1, np.int64)
         ground, prices = (self._pace, self._flight, self._offsets, self._corners), np.empty((3, many))
         while True:
-            pull_routes(*ground, (*given, stays), scratch, (*out, legs, turned), prices)
+            pull_routes(*ground, (*given, stays), scratch, (*out, legs, turns), prices)
             done = int(out[1][-1]) if many else 0
             returns = self._returns(out[0][:done], out[1]) & ~stays
             if not returns.any():
-                return Pulled(out[0][:done], out[1], legs[: turned[0]]), prices * self._metres
+                return Pulled(out[0][:done], out[1], legs[: turns[0]]), prices * self._metres
             stays |= returns
 
     def _returns(self, directions: NDArray[np.uint8], ends: NDArray[np.int64]) -> NDArray[np.bool_]:

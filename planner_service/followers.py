@@ -71,7 +71,7 @@ class Follower:
 
 
 @dataclass(frozen=True, slots=True)
-class _Told:
+class _Report:
     """The newest message of one agent: whom it named, when by its own clock, and when that was heard."""
 
     ids: frozenset[str]
@@ -107,7 +107,7 @@ class Followers:
         self._lease_ns = lease_ns
         self._max_cells = max_cells
         self._by_id: dict[str, Follower] = {}
-        self._told: dict[str, _Told] = {}
+        self._reports: dict[str, _Report] = {}
         """Agent's name as an author -> its newest message, for the lease."""
 
     def __len__(self) -> int:
@@ -126,16 +126,16 @@ class Followers:
 
     def on_chasers(self, chasers: Chasers, now_ns: int) -> None:
         """Sets the vehicles of an agent that chase the target, and their cells. Ignored if older than the last."""
-        before = self._told.get(chasers.author)
+        before = self._reports.get(chasers.author)
         if before is not None and chasers.stamp_ns < before.stamp_ns:
             return
-        told = _Told(frozenset(chasers.ids), chasers.stamp_ns, now_ns)
+        report = _Report(frozenset(chasers.ids), chasers.stamp_ns, now_ns)
         if before is not None:
-            for id in before.ids - told.ids:
+            for id in before.ids - report.ids:
                 self._by_id.pop(id, None)
-        elif len(self._told) >= CAPACITY:
-            del self._told[next(iter(self._told))]
-        self._told[chasers.author] = told
+        elif len(self._reports) >= CAPACITY:
+            del self._reports[next(iter(self._reports))]
+        self._reports[chasers.author] = report
         goals: list[int] | list[None] = [None] * len(chasers.ids)
         if chasers.target is None:
             goals = column(chasers.goals, "<u4").tolist()
@@ -194,8 +194,8 @@ class Followers:
     def drop_silent(self, now_ns: int) -> None:
         for id in [id for id, each in self._by_id.items() if now_ns - each.heard_ns > self._lease_ns]:
             del self._by_id[id]
-        for author in [author for author, each in self._told.items() if now_ns - each.heard_ns > self._lease_ns]:
-            del self._told[author]
+        for author in [author for author, each in self._reports.items() if now_ns - each.heard_ns > self._lease_ns]:
+            del self._reports[author]
 
     def any_due_in(self, changed: Sequence[Window], now_ns: int) -> bool:
         """Returns True if one of these windows lies on the route of a follower which may be pushed another now."""

@@ -193,8 +193,9 @@ def load_all() -> None:
         load(kernel)
 
 
-def build(kernels: Iterable[Kernel], tell: Callable[[Kernel], None] = lambda _: None) -> None:
-    """Compiles what no other builder has compiled or is compiling; then waits for these. Calls `tell` for each."""
+def build(kernels: Iterable[Kernel], report: Callable[[Kernel], None] = lambda _: None) -> None:
+    """Compiles what no other builder has compiled or is compiling; then waits for these. `report` is called for
+    each."""
     folder = cache_folder()
     assert folder is not None
     waiting = list(kernels)
@@ -206,7 +207,7 @@ def build(kernels: Iterable[Kernel], tell: Callable[[Kernel], None] = lambda _: 
                         load(kernel)
                 if is_on_disk(kernel):
                     waiting.remove(kernel)
-                    tell(kernel)
+                    report(kernel)
 
 
 @contextlib.contextmanager
@@ -254,19 +255,19 @@ class KernelLoader:
         """True if all may be called. Once true, it stays so."""
         return not self._missing
 
-    def load_first(self, tell: Callable[[str], None] = lambda _: None) -> None:
-        """Waits until a first route can be planned; later kernels are loaded as they appear. `tell` is handed a
+    def load_first(self, report: Callable[[str], None] = lambda _: None) -> None:
+        """Waits until a first route can be planned; later kernels are loaded as they appear. `report` is handed a
         sentence now and then."""
         if not can_build():
             for kernel in self._kernels:
                 load(kernel)
-        began_s = told_s = time.monotonic()
+        began_s = reported_s = time.monotonic()
         while waiting := missing(self._first):
             self._have_built()
             now_s = time.monotonic()
-            if now_s - told_s > 10.0:
-                told_s = now_s
-                tell(f"compiling kernels: {len(waiting)} of {len(self._first)} left, {now_s - began_s:.0f} s")
+            if now_s - reported_s > 10.0:
+                reported_s = now_s
+                report(f"compiling kernels: {len(waiting)} of {len(self._first)} left, {now_s - began_s:.0f} s")
             time.sleep(_POLL_S)
         self._missing = missing(self._kernels)
         if self._missing:

@@ -211,9 +211,9 @@ class PlannerService(PlanningProcess):
         self._take_fleet(now_ns)
         self._obey()
         self._lead(self._candidacy.tick(self._planner.tree.ready, now_ns) and not self._removed, now_ns)
-        for told in self._watch.drain(now_ns):
-            log.info("%s: %s", told.kind, told.text)
-            self._member.note(now_ns, told.kind, told.text, told.cell)
+        for note in self._watch.drain(now_ns):
+            log.info("%s: %s", note.kind, note.text)
+            self._member.note(now_ns, note.kind, note.text, note.cell)
         self._drop_unused(now_ns)
         for planner in self._planners.values():
             self._perform(planner, planner.tick(now_ns), now_ns)
@@ -225,23 +225,23 @@ class PlannerService(PlanningProcess):
         if self._planner.tree.ready and not self._served:
             self._served = True
             log.info("first tree: target %s, map version %d", self._target, self._planner.tree.map_version)
-        self._tell_lethal(now_ns)
-        self._tell_no_tracker(now_ns)
+        self._warn_lethal(now_ns)
+        self._warn_no_tracker(now_ns)
         self._member.tell_faults(self._faults, now_ns)
         self._member.tick(now_ns)
 
-    def _tell_lethal(self, now_ns: int) -> None:
+    def _warn_lethal(self, now_ns: int) -> None:
         lethal = self._planner.tree.lethal_target
         if lethal is None or not self._candidacy.leads:
             self._member.alarms.end("target-lethal", self._target, now_ns)
             return
         grid = self._cost_maps[GROUND].grid
-        shown = [f"cell:{row},{col}" for row, col in (grid.row_col(each) for each in lethal if each is not None)]
-        nearest = f"the nearest cell that can be reached is {shown[1]}" if shown[1:] else "no cell near it is open"
-        text = f"no vehicle can reach {self._target} on lethal ground at {shown[0]}; {nearest}"
+        cells = [f"cell:{row},{col}" for row, col in (grid.row_col(each) for each in lethal if each is not None)]
+        nearest = f"the nearest cell that can be reached is {cells[1]}" if cells[1:] else "no cell near it is open"
+        text = f"no vehicle can reach {self._target} on lethal ground at {cells[0]}; {nearest}"
         self._member.alarms.begin("target-lethal", self._target, text, now_ns, lethal.cell, self._target)
 
-    def _tell_no_tracker(self, now_ns: int) -> None:
+    def _warn_no_tracker(self, now_ns: int) -> None:
         waits = self._candidacy.leads and self._watch.pose is None and not (self._untracked or self._removed)
         if waits and now_ns - self._began_ns >= _AWAITED_NS:
             text = f"no tracker has published {self._target} since its planner started; its vehicles wait"
@@ -372,7 +372,7 @@ class PlannerService(PlanningProcess):
         for _, event in self._held:
             self._refuse(event, f"{event.topic.name}: the planner ends")
         if self._planner.leads:
-            self._tell_status(self._planner.status(now_ns))
+            self._publish_status(self._planner.status(now_ns))
         self._member.publish_stats(now_ns)
 
     def _lead(self, leads: bool, now_ns: int) -> None:
@@ -382,11 +382,11 @@ class PlannerService(PlanningProcess):
                 planner.lead(leads)
         super()._lead(leads, now_ns)
 
-    def _tell_status(self, status: PlannerStatus) -> None:
+    def _publish_status(self, status: PlannerStatus) -> None:
         """Publishes the status of "ground", with the vehicles of all classes."""
         following = sum(len(planner.followers) for planner in self._planners.values())
-        told = msgspec.structs.replace(status, following=following)
-        self._bus.publish(topics.STATUS, told, target=self._target)
+        status = msgspec.structs.replace(status, following=following)
+        self._bus.publish(topics.STATUS, status, target=self._target)
 
     def _perform(self, planner: Planner, actions: list[Action], now_ns: int) -> None:
         name = planner.vehicle_class
@@ -399,6 +399,6 @@ class PlannerService(PlanningProcess):
                 case PushedRoute() as pushed:
                     self._push(pushed)
                 case PlannerStatus() as status:
-                    self._tell_status(status)
+                    self._publish_status(status)
                 case Believed() as believed:
                     self._bus.publish(topics.BELIEVED, believed, target=self._target)

@@ -155,12 +155,12 @@ STRATEGIES: Mapping[str, Callable[[], Strategy]] = {
 """Every built-in strategy."""
 
 
-def strategy_of(plugin: Plugin, world: StrategyWorld, tell: Tell) -> Strategy:
-    """The strategy that a scenario names. Raises ConfigError if it cannot be made; `tell` is called with a later
+def strategy_of(plugin: Plugin, world: StrategyWorld, report: Tell) -> Strategy:
+    """The strategy that a scenario names. Raises ConfigError if it cannot be made; `report` is called with a later
     fault."""
     if plugin.factory is None:
         return STRATEGIES[plugin.named.name]()
-    return PluginStrategy(plugin.make(world), Guard(plugin, tell))
+    return PluginStrategy(plugin.make(world), Guard(plugin, report))
 
 
 class PluginStrategy:

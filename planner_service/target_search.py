@@ -465,8 +465,8 @@ class TargetSearch:
         """The newest sighting that had expired when it was heard."""
         self._begun_from: Sighted | None = None
         """By which of these the search began."""
-        self._tell_ns = 0
-        self._has_told = False
+        self._publish_ns = 0
+        self._has_published = False
         """True if the last message was about a search under way."""
         self._searched: TargetPose | None = None
         """The newest pose when the search began."""
@@ -496,8 +496,8 @@ class TargetSearch:
             self._first_ns = self._ticked_ns = now_ns
         elapsed_s = (now_ns - self._ticked_ns) / NS_PER_S * self.time_scale
         self._ticked_ns = now_ns
-        told_since = pose is None and self._begun_from is not self._remembered
-        if self.active and (pose is not self._searched or told_since):
+        reported_since = pose is None and self._begun_from is not self._remembered
+        if self.active and (pose is not self._searched or reported_since):
             self.searcher.end()
         if not self.active:
             nearest_m = math.inf
@@ -527,10 +527,10 @@ class TargetSearch:
 
     def belief_message(self, target: str, incarnation: int, now_ns: int) -> Believed | None:
         """Returns the belief, for people; None if it is not due."""
-        if now_ns < self._tell_ns or not (self.active or self._has_told):
+        if now_ns < self._publish_ns or not (self.active or self._has_published):
             return None
-        self._tell_ns = now_ns + _TELL_NS
-        self._has_told = self.active
+        self._publish_ns = now_ns + _TELL_NS
+        self._has_published = self.active
         cells, shares, side_m = self.searcher.likeliest(MOST_BELIEVED)
         return Believed(
             target=target,

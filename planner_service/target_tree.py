@@ -537,7 +537,7 @@ class TargetTree:
         """Continues a stopped growth up to these cells."""
         if not self.times.may_stop and self._is_whole:
             return
-        starts, unknown, half = self._look(cells)
+        starts, unknown, half = self._find_starts(cells)
         if not self._is_whole and unknown:
             if self._growth.go_on(starts, self.times.most_cells) < 0:
                 self._too_far = True
@@ -552,7 +552,7 @@ class TargetTree:
         """Notes cells from which queries will come, such as those of a standby's followers: growths will reach
         them."""
         if self.ready and self._can_stop:
-            starts, _, half = self._look(cells)
+            starts, _, half = self._find_starts(cells)
             self._note(starts, half)
 
     def _note(self, starts: NDArray[np.int64], half: int) -> None:
@@ -578,9 +578,9 @@ class TargetTree:
 
     def _open(self, cells: Any) -> NDArray[np.int64]:
         """Those of some numbers that are passable cells of the grid, padded."""
-        return self._look(cells)[0]
+        return self._find_starts(cells)[0]
 
-    def _look(self, cells: Any) -> tuple[NDArray[np.int64], int, int]:
+    def _find_starts(self, cells: Any) -> tuple[NDArray[np.int64], int, int]:
         """Returns those of some numbers that are passable cells of the grid, padded; how many of them a growth that
         has stopped did not reach; and how many rows or columns the farthest is away from the root."""
         asked = _in_a_row(cells)

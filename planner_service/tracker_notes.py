@@ -49,7 +49,7 @@ class TargetWatch:
         """Tracker, or incarnation of one without a name -> its poses that were refused."""
         self._named: set[tuple[str, str | int]] = set()
         """(kind of oddity, tracker), reported before."""
-        self._to_tell: list[Tell] = []
+        self._pending: list[Tell] = []
         for name in COUNTS:
             counters.count(name, 0)
 
@@ -80,8 +80,8 @@ class TargetWatch:
             self._count("poses_outside")
             shape = f"{self._grid.rows} x {self._grid.cols} cells"
             cell = f"cell {pose.cell}" if pose.cell != CELL_OF_PLACE else f"{pose.x_m:.0f}, {pose.y_m:.0f} m"
-            said = f"{_name(pose)} puts it into {cell}, outside of the terrain of {shape}: not used"
-            self._name_once("pose-outside", pose, said)
+            text = f"{_name(pose)} puts it into {cell}, outside of the terrain of {shape}: not used"
+            self._name_once("pose-outside", pose, text)
 
     def on_sighting(self, pose: TargetPose, now_ns: int) -> None:
         """The best sighting of a target that has no tracker."""
@@ -94,8 +94,8 @@ class TargetWatch:
         """Returns the sentences for operators that are new, none on a standby."""
         if not self._lost and self._tracking.lost(now_ns):
             self._lose(now_ns)
-        told, self._to_tell = self._to_tell, []
-        return told if self.leads else []
+        notes, self._pending = self._pending, []
+        return notes if self.leads else []
 
     def _owned_by(self, pose: TargetPose, now_ns: int) -> None:
         tracker, before = _name(pose), self._tracker
@@ -103,13 +103,13 @@ class TargetWatch:
         self._handed_over = pose.lease_s == 0
         self._found(f"{tracker} tracks it", now_ns)
         if before not in ("", tracker):
-            self._tell("tracker-changed", f"{tracker} tracks it now, before that {before} did")
+            self._note("tracker-changed", f"{tracker} tracks it now, before that {before} did")
 
     def _found(self, how: str, now_ns: int) -> None:
         if self._lost:
             self._lost = False
             lost_s = (now_ns - self._lost_since_ns) / NS_PER_S
-            self._tell("tracker-back", f"{how} again, after {lost_s:.1f} s without a known position")
+            self._note("tracker-back", f"{how} again, after {lost_s:.1f} s without a known position")
 
     def _lose(self, now_ns: int) -> None:
         pose = self._tracking.pose
@@ -124,7 +124,7 @@ class TargetWatch:
             why = f"{self._tracker} has handed it over, and there is no other tracker"
         else:
             why = f"{self._tracker} has been silent for longer than its lease of {pose.lease_s:g} s"
-        self._tell("tracker-lost", f"{why}; {then}", pose.cell)
+        self._note("tracker-lost", f"{why}; {then}", pose.cell)
 
     def _refuse(self, pose: TargetPose) -> None:
         self._count("poses_refused")
@@ -145,13 +145,13 @@ class TargetWatch:
             self._counters.count(name)
 
     def _name_once(self, kind: str, pose: TargetPose, text: str) -> None:
-        told = (kind, _key(pose))
-        if told not in self._named and len(self._named) < _MOST_NAMED:
-            self._named.add(told)
-            self._tell(kind, text)
+        key = (kind, _key(pose))
+        if key not in self._named and len(self._named) < _MOST_NAMED:
+            self._named.add(key)
+            self._note(kind, text)
 
-    def _tell(self, kind: str, text: str, cell: int | None = None) -> None:
-        self._to_tell.append(Tell(kind, f"target {self.target}: {text}", cell))
+    def _note(self, kind: str, text: str, cell: int | None = None) -> None:
+        self._pending.append(Tell(kind, f"target {self.target}: {text}", cell))
 
 
 def _key(pose: TargetPose) -> str | int:

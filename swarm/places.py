@@ -96,7 +96,7 @@ def read_place(given: Given, what: str) -> Place:
     whole = all(_WHOLE.fullmatch(number) for number in (first, second))
     place = Place(given.strip()[:60], kind, float(first), float(second), whole)
     if kind == "latlon" and not _is_degrees(place):
-        raise ConfigError(f"{what} is {_shown(place)}, expected a latitude (-90 to 90) and longitude (-360 to 360)")
+        raise ConfigError(f"{what} is {_text(place)}, expected a latitude (-90 to 90) and longitude (-360 to 360)")
     return place
 
 
@@ -105,14 +105,14 @@ def cell_of(given: Given, frame: Frame, what: str) -> int:
     and on a row or column that is no whole number: half a row may be half a map away."""
     place, grid = read_place(given, what), frame.grid
     if place.kind == "cell" and not place.whole:
-        raise ConfigError(f"{what} is {_shown(place)}; expected whole numbers: a row and a column")
+        raise ConfigError(f"{what} is {_text(place)}; expected whole numbers: a row and a column")
     kinds = _kinds_of(place, grid)
     cells = {kind: cell for kind in kinds if (cell := _cell_at(_corner(place, kind, frame, what), grid)) >= 0}
     if not cells:
         extents = "; ".join(extent_of(frame, kind) for kind in kinds)
-        raise ConfigError(f"{what} is {_shown(place)}, outside the terrain: {extents}{_perhaps(place, frame)}")
+        raise ConfigError(f"{what} is {_text(place)}, outside the terrain: {extents}{_perhaps(place, frame)}")
     if len(set(cells.values())) > 1:
-        raise ConfigError(f"{what} is {_shown(place)}, {_two_meanings(kinds)}")
+        raise ConfigError(f"{what} is {_text(place)}, {_two_meanings(kinds)}")
     return next(iter(cells.values()))
 
 
@@ -126,13 +126,13 @@ def corners_of(given: Sequence[Given], frame: Frame, what: str) -> list[Corner]:
         found = {kind: [_inside(_corner(place, kind, frame, what), grid) for place in bare] for kind in kinds}
         fitting = [kind for kind in kinds if all(found[kind])] or [kind for kind in kinds if any(found[kind])]
         if len(fitting) != 1:
-            raise ConfigError(f"{what} begins with {_shown(bare[0])}, {_two_meanings(kinds)}")
+            raise ConfigError(f"{what} begins with {_text(bare[0])}, {_two_meanings(kinds)}")
         kinds = (fitting[0],)
     corners = [_corner(place, place.kind or kinds[0], frame, what) for place in places]
     for place, corner in zip(places, corners, strict=True):
         if not all(map(math.isfinite, corner)):
             hint = _perhaps(place, frame)
-            raise ConfigError(f"{what} is {_shown(place)}, far from the terrain: {extent_of(frame)}{hint}")
+            raise ConfigError(f"{what} is {_text(place)}, far from the terrain: {extent_of(frame)}{hint}")
     return corners
 
 
@@ -214,7 +214,7 @@ def _corner(place: Place, kind: Kind, frame: Frame, what: str) -> Corner:
     if kind == "latlon":
         if grid.crs == "local":
             raise ConfigError(
-                f"{what} is {_shown(place)}, and the terrain has no place on Earth; give xy:X,Y in its own metres"
+                f"{what} is {_text(place)}, and the terrain has no place on Earth; give xy:X,Y in its own metres"
                 " or cell:ROW,COL, or say where it lies with terrain.crs"
             )
         if not _is_degrees(place):
@@ -269,7 +269,7 @@ def _short(frame: Frame, degrees: tuple[float, float], cell: int) -> str:
     return text
 
 
-def _shown(place: Place) -> str:
+def _text(place: Place) -> str:
     return place.text if place.text.startswith("[") else repr(place.text)
 
 

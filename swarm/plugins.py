@@ -58,7 +58,7 @@ def call_within(seconds: float, call: Callable[[], T]) -> T:
     """
     if threading.current_thread() is not threading.main_thread():
         return call()
-    _tell_line()
+    _print_line_when_killed()
     before = signal.signal(signal.SIGALRM, _Alarm().ring)
     began_s = time.monotonic()
     left_s, every_s = signal.setitimer(signal.ITIMER_REAL, seconds, seconds)
@@ -91,7 +91,7 @@ class _Alarm:
 
 
 @functools.cache
-def _tell_line() -> None:
+def _print_line_when_killed() -> None:
     # Written by the signal's handler itself, which needs no interpreter; then the signal kills.
     faulthandler.register(KILLED_BY, file=2, all_threads=False, chain=True)
 
@@ -115,14 +115,14 @@ class Nonsense(SwarmError):  # noqa: N818
 class Guard:
     """The single place where one plug-in is called.
 
-    tell   takes its fault
-    works  false once it has failed: then it is not called any more
+    report  takes its fault
+    works   false once it has failed: then it is not called any more
     """
 
-    def __init__(self, plugin: Plugin, tell: Tell) -> None:
+    def __init__(self, plugin: Plugin, report: Tell) -> None:
         self.works = True
         self._plugin = plugin
-        self._tell = tell
+        self._report = report
 
     def ask(self, call: Callable[[], object], check: Callable[[object], T], otherwise: Callable[[], T]) -> T:
         """Returns the result of `call` after `check`, or of `otherwise` if the plug-in fails or has failed.
@@ -145,7 +145,7 @@ class Guard:
     def _fail(self, what: str) -> None:
         self.works = False
         kind = self._plugin.named.kind
-        self._tell(f"{self._plugin} of {self._plugin.named.key}: {kind.method} {what}; {kind.failing}")
+        self._report(f"{self._plugin} of {self._plugin.named.key}: {kind.method} {what}; {kind.failing}")
 
 
 Factory = Callable[[Any, Any], Any]

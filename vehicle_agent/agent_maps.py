@@ -155,7 +155,7 @@ class Learning:
     def __init__(self, measured: Measured, prior_s_per_m: Floats) -> None:
         self._measured = measured
         self._prior = prior_s_per_m.reshape(-1)
-        self._told_version = 0
+        self._sent_version = 0
         self._due_ns = 0
 
     def tick(self, driven: Iterable[tuple[int, float]], now_ns: int) -> Mapping[int, Measurement]:
@@ -166,9 +166,9 @@ class Learning:
         measured = self._measured
         for cell, pace_s_per_m in driven:
             measured.add(cell, pace_s_per_m, self._prior.item(cell))
-        if measured.version == self._told_version or now_ns < self._due_ns:
+        if measured.version == self._sent_version or now_ns < self._due_ns:
             return {}
-        self._told_version, self._due_ns = measured.version, now_ns + _EVERY_NS
+        self._sent_version, self._due_ns = measured.version, now_ns + _EVERY_NS
         return measured.by_key
 
 
@@ -262,10 +262,10 @@ class ZonesAround:
         ground = cost_map.ground_s_per_m.copy()
         flat, prior = ground.reshape(-1), cost_map.terrain.ground_s_per_m.reshape(-1)
         for place in self._tiles:
-            for_all, zones = self._said_without_zones(place)
+            for_all, zones = self._stated_without_zones(place)
             own = NO_STATEMENTS
             if self._maps.class_number:
-                own, own_zones = self._said_without_zones(grid.tile_for(place, self._maps.class_number))
+                own, own_zones = self._stated_without_zones(grid.tile_for(place, self._maps.class_number))
                 zones += own_zones
             for each in zones:
                 cells = self._cells_of(place, each)
@@ -286,7 +286,7 @@ class ZonesAround:
             found += ((rows + window.row0) * grid.cols + cols + window.col0).tolist()
         return found
 
-    def _said_without_zones(self, tile: int) -> tuple[Statements, list[NDArray[np.uint16]]]:
+    def _stated_without_zones(self, tile: int) -> tuple[Statements, list[NDArray[np.uint16]]]:
         """Returns the marks of a tile without its zones, and the cells in it of each zone."""
         sets, now_ns = self._replica.held.of_tile(tile), self._replica.now_ns
         zones = [standing(each, now_ns).cells for each in sets if is_zone(each.author)]

@@ -131,14 +131,14 @@ def shares_costs(assigner: Assigner) -> bool:
     return getattr(assigner, "shares_costs", False) is True
 
 
-def assigner_of(plugin: Plugin, world: AssignmentWorld, tell: Tell) -> Assigner:
+def assigner_of(plugin: Plugin, world: AssignmentWorld, report: Tell) -> Assigner:
     """Returns the assigner that a scenario names, built-in or a plug-in. Raises ConfigError if it cannot be made.
 
-    tell  called with the fault if the plug-in fails later
+    report  called with the fault if the plug-in fails later
     """
     if plugin.factory is None:
         return ASSIGNERS[plugin.named.name](world)
-    return PluginAssigner(plugin.make(world), Guard(plugin, tell))
+    return PluginAssigner(plugin.make(world), Guard(plugin, report))
 
 
 class PluginAssigner:

@@ -33,7 +33,7 @@ class ChasersReport:
     def __init__(self, author: str, vehicle_class: str = GROUND) -> None:
         self._author = author
         self._vehicle_class = vehicle_class
-        self._told: dict[str | None, tuple[dict[str, tuple[int, int | None]], int]] = {}
+        self._sent: dict[str | None, tuple[dict[str, tuple[int, int | None]], int]] = {}
         """Target, or None for places -> cell and goal of each of its chasers in the last message, and the time; for
         all that have chasers."""
 
@@ -44,20 +44,20 @@ class ChasersReport:
         vehicles  id, target and path of each: the cells of the terrain that it may stand on or enter, in order, at
                   least one
         """
-        chasers: dict[str | None, dict[str, tuple[Sequence[int], int | None]]] = {each: {} for each in self._told}
+        chasers: dict[str | None, dict[str, tuple[Sequence[int], int | None]]] = {each: {} for each in self._sent}
         for id, target, path in vehicles:
             if target is not None and path:
                 goal = goal_of(target)
                 chasers.setdefault(target if goal is None else None, {})[id] = path, goal
         for target, paths in chasers.items():
-            last = self._told.get(target)
+            last = self._sent.get(target)
             if last is not None and now_ns - last[1] < HEARTBEAT_NS and _holds(last[0], paths):
                 continue
             cells = {id: (path[-1], goal) for id, (path, goal) in paths.items()}
             if cells:
-                self._told[target] = cells, now_ns
+                self._sent[target] = cells, now_ns
             else:
-                del self._told[target]
+                del self._sent[target]
             yield Chasers(
                 target=target,
                 author=self._author,

@@ -91,7 +91,7 @@ class AgentService(MemberService):
         self._places_job = place_job(setup.scenario, self.agent.plan.group.name)
         """The process that plans to places for the group."""
         self._obeyed_version = 0
-        self._goals_told: tuple[list[GoalState], int] = [], 0
+        self._goals_sent: tuple[list[GoalState], int] = [], 0
         """The states of goals that were published last, and when."""
         self._roster = Roster()
         self._planners_changed = False
@@ -234,13 +234,13 @@ class AgentService(MemberService):
         self._take_obstacles(now_ns)
         self._drive(now_ns)
         columns = Places(agent.grid, agent.vehicles.values())
-        self._tell_sighted(columns, now_ns)
+        self._publish_sighted(columns, now_ns)
         self._perform(agent.decide(now_ns))
         self.counters.count("blocked_ticks", agent.blocked_ticks)
         self.counters.counts["sets_foreign"] = self._replica.counts["sets_foreign"]
         self._report(columns, now_ns)
         paths, terrain_cell = agent.holdings.paths, agent.grid.terrain_cell
-        self._tell_goals(now_ns)
+        self._publish_goals(now_ns)
         kept = agent.holdings.keeps + 1
         chasing = [
             (id, vehicle.target, list(map(terrain_cell, paths[id][:kept])))
@@ -302,15 +302,15 @@ class AgentService(MemberService):
             return self._obeyed_version == self._order_client.book.version
         return self._sync.holds(order.author, order.sets, self._now_ns)
 
-    def _tell_goals(self, now_ns: int) -> None:
+    def _publish_goals(self, now_ns: int) -> None:
         """Publishes how far vehicles are with their goals, and raises alarms about those which are blocked."""
-        agent, since_ns = self.agent, now_ns - self._goals_told[1]
+        agent, since_ns = self.agent, now_ns - self._goals_sent[1]
         if not len(agent.goals.book) or since_ns < _GOALS_APART_NS:
             return
         states = agent.goal_states(self._removed)
-        if states == self._goals_told[0] and since_ns < NS_PER_S:
+        if states == self._goals_sent[0] and since_ns < NS_PER_S:
             return
-        self._goals_told = states, now_ns
+        self._goals_sent = states, now_ns
         self._bus.publish(
             topics.GOAL_STATES,
             GoalStates(agent=self._setup.id, stamp_ns=now_ns, states=states),
@@ -373,7 +373,7 @@ class AgentService(MemberService):
             self.agent.see_target(pose, now_ns)
             self._take_target_obstacles(pose, now_ns)
 
-    def _tell_sighted(self, places: Places, now_ns: int) -> None:
+    def _publish_sighted(self, places: Places, now_ns: int) -> None:
         self._detector.lose(self.agent.lost(now_ns), now_ns)
         seen = self._detector.detect(places, now_ns)
         if seen:

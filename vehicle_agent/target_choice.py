@@ -44,7 +44,7 @@ class GroupCosts:
         self._heard: dict[str, tuple[SharedCosts, int]] = {}
         """Agent -> its newest word, and when that came."""
 
-    def tell(
+    def report(
         self,
         vehicles: Sequence[str],
         costs_s: Mapping[str, NDArray[np.float32]],
@@ -277,13 +277,13 @@ class Assignment:
             return None
         # Input of the others: the costs of vehicles that may chase any target.
         may = [n for n, id in enumerate(asked.vehicles) if id in vehicles and id not in standing]
-        told_s = {
+        shared_s = {
             target: column[may]
             for target, column in self._costs_s.items()
             if target in self.targets and target not in empty
         }
         ids = [asked.vehicles[n] for n in may]
-        return self.group.tell(ids, told_s, [vehicles[id].target for id in ids], now_ns)
+        return self.group.report(ids, shared_s, [vehicles[id].target for id in ids], now_ns)
 
     def _share_out(
         self,

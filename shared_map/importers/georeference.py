@@ -412,9 +412,9 @@ def place_on(dataset: Any, grid: GridSpec, given: str | None, what: str, key: st
     """
     same_shape = (dataset.height, dataset.width) == grid.shape
     has_place, own = not dataset.transform.is_identity, own_system(dataset, what)
-    turned = dataset.tags().get("EXIF_Orientation", "1")
-    if not has_place and turned != "1":
-        raise TerrainError(f"{what} has EXIF orientation {turned}, expected 1: save it upright, or georeference it")
+    exif = dataset.tags().get("EXIF_Orientation", "1")
+    if not has_place and exif != "1":
+        raise TerrainError(f"{what} has EXIF orientation {exif}, expected 1: save it upright, or georeference it")
     given = None if own and key == "terrain.crs" else given
     if not has_place or (grid.crs == "local" and given is None):
         if not same_shape:

@@ -169,10 +169,10 @@ def read_ros(path: Path) -> Numbers:
         raise TerrainError(f"terrain {path} is no ROS map: {explain(str(error), raw, _RosMap, 'map')}") from error
     except (yaml.YAMLError, ValueError, RecursionError) as error:
         raise TerrainError(f"terrain {path}: no YAML: {' '.join(str(error).split())[:LONGEST_REASON]}") from error
-    west, south, *turned = found.origin
+    west, south, *rotation = found.origin
     image, occupied, free = path.parent / found.image, found.occupied_thresh, found.free_thresh
-    if turned and abs(turned[0]) > 1e-9:
-        raise TerrainError(f"terrain {path}: the origin is turned by {turned[0]:g} rad; turn the image instead")
+    if rotation and abs(rotation[0]) > 1e-9:
+        raise TerrainError(f"terrain {path}: the origin is turned by {rotation[0]:g} rad; turn the image instead")
     if free > occupied:
         raise TerrainError(f"terrain {path}: thresholds are {free:g}, {occupied:g}; expected free <= occupied")
     pixels = _grey(image)

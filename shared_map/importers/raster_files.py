@@ -251,9 +251,9 @@ def _text_numbers(dataset: Any, path: Path, what: str) -> Floats:
                 wrong = next(n for n, each in enumerate(fits) if not _NUMBER.fullmatch(each))
             if wrong < len(words):
                 at = next(itertools.islice(re.finditer(rb"\S+", text), wrong, None)).start()
-                shown = words[wrong][:40].decode("ascii", "replace")
+                quoted = words[wrong][:40].decode("ascii", "replace")
                 line = lines + text.count(b"\n", 0, at)
-                raise TerrainError(f"{what}, line {line}: found {shown!r}; {expected}")
+                raise TerrainError(f"{what}, line {line}: found {quoted!r}; {expected}")
             count += len(fits)
             lines += piece.count(b"\n")
     if count < numbers.size:
@@ -285,8 +285,8 @@ def _skip_header(file: BinaryIO, dataset: Any, what: str) -> tuple[int, bytes | 
     for name, word in ((name, word) for name, word in header.items() if name not in _WORDS):
         is_count = name in _COUNTS
         if not _NUMBER.fullmatch(word) or (is_count and number_of(word) not in dataset.shape):
-            shown, kind = word[:40].decode("ascii", "replace"), "a whole number" if is_count else "a number"
-            raise TerrainError(f"{what}: its header says {name} {shown!r}, expected {kind}")
+            quoted, kind = word[:40].decode("ascii", "replace"), "a whole number" if is_count else "a number"
+            raise TerrainError(f"{what}: its header says {name} {quoted!r}, expected {kind}")
     corner = [name for name in header if name.startswith(("xll", "yll"))]
     if driver == "AAIGrid" and (len(corner), len({name[3:] for name in corner})) != (2, 1):
         raise TerrainError(f"{what}: its header needs xllcorner and yllcorner, or xllcenter and yllcenter")

@@ -221,8 +221,8 @@ def _factors(heights_m: Floats) -> list[float]:
     peaks[per_cell < _SLOWEST] = 0
     if not peaks.any():
         return []
-    at, shown = find_peaks(peaks, height=_PEAK * np.median(peaks[peaks > 0]), distance=4 * _PEAK_APART)
-    highest = per_cell[at[np.argsort(shown["peak_heights"])[-_PEAKS:]]]
+    at, properties = find_peaks(peaks, height=_PEAK * np.median(peaks[peaks > 0]), distance=4 * _PEAK_APART)
+    highest = per_cell[at[np.argsort(properties["peak_heights"])[-_PEAKS:]]]
     found = {2.0, *(times / often for each in highest for often in (each, 1 - each) for times in (1, 2, 3))}
     most = min(_MOST_FACTOR, len(heights_m) / (3 * _REACH))  # something is left between the ends
     return sorted((each for each in found if _LEAST_FACTOR <= each <= most), reverse=True)

@@ -131,7 +131,7 @@ class KeptOrders:
             case orders.SendVehicle() as order:
                 given = self._send(order, now_ns) if order.changes else None
                 if isinstance(given, orders.VehicleGoals):
-                    self._tell(agent_of(given.name))
+                    self._send_goals(agent_of(given.name))
                 if not isinstance(given, str):
                     asked.answer(orders.Goals(id=self._id, goals=list(self.goals), given=given), keeper=self._id)
             case _:
@@ -172,7 +172,7 @@ class KeptOrders:
             return  # the alarm about marks covers it, which fare no better; meanwhile askers ask others, too
         self._bus.publish(ORDERS, self._orders(), role="keeper", id=self._id)
         for agent in sorted({agent_of(goals.name) for goals in self.goals}):
-            self._tell(agent)
+            self._send_goals(agent)
 
     def _vehicles_with(self, asked: str) -> list[str]:
         """All vehicles of the scenario, and one that was asked for if its agent has been added."""
@@ -219,7 +219,7 @@ class KeptOrders:
 
     # --- vehicles that are sent -------------------------------------------------------------------------------
 
-    def _tell(self, agent: str) -> None:
+    def _send_goals(self, agent: str) -> None:
         self._bus.publish(GOALS, self._goals_of(agent), id=self._id, agent=agent)
 
     def _goals_of(self, agent: str) -> orders.Goals:

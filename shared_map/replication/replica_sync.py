@@ -124,7 +124,7 @@ class MapSync:
         self._answers_left = _ANSWERS_PER_TICK
         self._parts: deque[tuple[dict[str, bytes], Place | None, Place | None]] = deque()
         self._offers_left = self._offers_due_ns = 0  # sets that may still be given until then
-        self._looks_left = self._offer_place = 0  # authors to compare in this tick; the place of the next
+        self._comparisons_left = self._offer_place = 0  # authors to compare in this tick; the place of the next
         # Own tile put lately -> digests of changes name it until then; None: it has not been named yet.
         self._changed: dict[int, int | None] = {}
         self._digests = PendingDigests()
@@ -206,7 +206,7 @@ class MapSync:
         self.publish(self.replica.tick(now_ns))
         if self._join_due_ns is not None and now_ns >= self._join_due_ns:
             self._join()
-        self._looks_left = _LOOKS_PER_TICK
+        self._comparisons_left = _LOOKS_PER_TICK
         for pending in self._digests.due(now_ns):
             self._compare(pending, now_ns)
         self._send_digest(now_ns)
@@ -466,9 +466,9 @@ class MapSync:
 
     def _next_silent(self, now_ns: int) -> list[str]:
         """Dead authors, for one digest: all, or as many as this tick allows; the next digest continues there."""
-        most = self._looks_left if self._offers_left else 0
+        most = self._comparisons_left if self._offers_left else 0
         authors = self.replica.held.ledger.authors_from(self._offer_place, most)
-        self._looks_left -= len(authors)
+        self._comparisons_left -= len(authors)
         self._offer_place = 0 if len(authors) < most else self._offer_place + most
         return [author for author in authors if self._silent(author, now_ns)]
 

@@ -74,9 +74,9 @@ class ZoneFacts:
         if left_out:
             parts.append(f"left out: {', '.join(left_out)}")
         if file.repaired:
-            shown = ", ".join(file.repaired[:5]) + (" ..." if len(file.repaired) > 5 else "")
+            listed = ", ".join(file.repaired[:5]) + (" ..." if len(file.repaired) > 5 else "")
             parts.append(
-                f"{len(file.repaired)} that cross themselves or are not closed were repaired: feature {shown}"
+                f"{len(file.repaired)} that cross themselves or are not closed were repaired: feature {listed}"
             )
         return "; ".join(parts)
 

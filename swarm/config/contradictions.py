@@ -57,8 +57,8 @@ def contradictions(scenario: Scenario) -> Iterator[Fault]:
     aloft = [f"class {name}, which flies" for name in aloft_classes(scenario)]
     climbs = ["cost.directional = true"] * scenario.cost.directional + aloft
     if climbs and (weight := scenario.planner.length_weight):
-        said = f"planner.length_weight: {weight:g} does not go with {climbs[0]}; leave it out"
-        yield ("planner.length_weight", "cost.directional", "classes"), said
+        text = f"planner.length_weight: {weight:g} does not go with {climbs[0]}; leave it out"
+        yield ("planner.length_weight", "cost.directional", "classes"), text
     yield from _class_faults(scenario)
     yield from _group_faults(scenario)
     marked = scenario.monitor.show_target
@@ -84,18 +84,18 @@ def _group_faults(scenario: Scenario) -> Iterator[Fault]:
             yield ("groups.name",), f"groups: {name!r} is not free: {reason}"
         longer = [other for other in names if other.startswith(f"{name}.")]
         if longer:  # the id of an author begins with its group and a point
-            said = f"groups: {longer[0]!r} begins with the name of another group, {name!r}, and '.'"
-            yield ("groups.name",), said
+            text = f"groups: {longer[0]!r} begins with the name of another group, {name!r}, and '.'"
+            yield ("groups.name",), text
     for n, group in enumerate(scenario.groups):
         for id in group.targets:
             if id not in ids:
-                said = f"groups: {group.name} chases {id!r}, which is no target{choice(id, ids, ' there are ')}"
-                yield (f"groups[{n}].targets", "targets.name", "targets.count"), said
+                text = f"groups: {group.name} chases {id!r}, which is no target{choice(id, ids, ' there are ')}"
+                yield (f"groups[{n}].targets", "targets.name", "targets.count"), text
         for key in ("reads", "writes"):
             for name in getattr(group, key):
                 if name != "*" and name not in names:
-                    said = f"groups: {group.name}: {key} names {name!r}, which is no group{nearest(name, names)}"
-                    yield (f"groups[{n}].{key}", "groups.name"), said
+                    text = f"groups: {group.name}: {key} names {name!r}, which is no group{nearest(name, names)}"
+                    yield (f"groups[{n}].{key}", "groups.name"), text
 
 
 def cost_faults(cost: CostConfig, where: str) -> Iterator[Fault]:
@@ -113,12 +113,12 @@ def cost_faults(cost: CostConfig, where: str) -> Iterator[Fault]:
     yield from ((table, f"{where}.slope_table: {each}") for each in _table_faults(cost))
     top, flat = cost.top_speed_m_per_s, cost.flat_speed_m_per_s
     if top is not None and top < flat:
-        said = f"{where}.top_speed_m_per_s: {top:g} is less than flat_speed_m_per_s = {flat:g}"
-        yield keys("top_speed_m_per_s", "flat_speed_m_per_s", "preset"), said
+        text = f"{where}.top_speed_m_per_s: {top:g} is less than flat_speed_m_per_s = {flat:g}"
+        yield keys("top_speed_m_per_s", "flat_speed_m_per_s", "preset"), text
     for key in ("max_climb_deg", "max_descent_deg"):
         if getattr(cost, key) is not None and not cost.directional:
-            said = f"{where}.{key} limits single steps: set directional = true, or use max_slope_deg"
-            yield keys(key, "directional", "preset"), said
+            text = f"{where}.{key} limits single steps: set directional = true, or use max_slope_deg"
+            yield keys(key, "directional", "preset"), text
 
 
 def _table_faults(cost: CostConfig) -> Iterator[str]:
@@ -141,36 +141,36 @@ def _class_faults(scenario: Scenario) -> Iterator[Fault]:
     """Yields the faults of a scenario's classes, without those that `[cost]` has, too."""
     names = [each.name for each in scenario.classes]
     if GROUND in names:
-        said = f"classes: {GROUND!r} is the class of [cost] and [vehicles] itself; choose another name"
-        yield ("classes.name",), said
+        text = f"classes: {GROUND!r} is the class of [cost] and [vehicles] itself; choose another name"
+        yield ("classes.name",), text
     held = {fault for _, fault in cost_faults(scenario.cost, "cost")}
     for n, each in enumerate(scenario.classes):
         where = f"classes[{n}]"
         for key in SHARED:
             if getattr(each.cost, key) != getattr(scenario.cost, key):
-                said = f"{where}.cost.{key} is for all classes alike: give it in [cost] instead"
-                yield (f"{where}.cost.{key}", f"cost.{key}"), said
+                text = f"{where}.cost.{key} is for all classes alike: give it in [cost] instead"
+                yield (f"{where}.cost.{key}", f"cost.{key}"), text
         for keys, fault in cost_faults(each.cost, f"{where}.cost"):
             if fault.removeprefix(f"{where}.") not in held:
                 yield (*keys, "cost"), fault
         if each.air is not None and not scenario.wind.speed_m_per_s < each.air.speed_m_per_s:
             key, wind = f"{where}.air.speed_m_per_s", scenario.wind.speed_m_per_s
-            said = (
+            text = (
                 f"{key}: found {each.air.speed_m_per_s:g}, expected more than wind.speed_m_per_s = {wind:g}:"
                 f" {each.name} could not fly against it"
             )
-            yield (key, "wind.speed_m_per_s"), said
+            yield (key, "wind.speed_m_per_s"), text
         for k, zone in enumerate(each.air.no_fly if each.air is not None else ()):
             drawn = zone.polygon is not None or zone.polygon_m is not None
             if zone.kind != "forbidden" or not drawn or zone.file is not None or zone.mask is not None:
                 key, lacks = f"{where}.air.no_fly[{k}]", "" if drawn else " and no polygon"
-                said = f'{key}: expected kind = "forbidden" and a polygon, found kind {zone.kind!r}{lacks}'
-                yield (key,), said
+                text = f'{key}: expected kind = "forbidden" and a polygon, found kind {zone.kind!r}{lacks}'
+                yield (key,), text
     for n, group in enumerate(scenario.groups):
         if group.vehicle_class not in (GROUND, *names):
             known = choice(group.vehicle_class, [GROUND, *names], " there are ")
-            said = f"groups: {group.name}: class is {group.vehicle_class!r}, which is no class{known}"
-            yield (f"groups[{n}].class", "classes.name"), said
+            text = f"groups: {group.name}: class is {group.vehicle_class!r}, which is no class{known}"
+            yield (f"groups[{n}].class", "classes.name"), text
 
 
 _VALUES = {"factor": "factor", "pace": "pace_s_per_m"}

@@ -174,7 +174,7 @@ class _RecordedService:
     def __init__(self, service: Service, recording: Recording) -> None:
         self._service = service
         self._recording = recording
-        self._loop, self._told = Counters(), dict[tuple[str, str | int], int | float]()
+        self._loop, self._recorded = Counters(), dict[tuple[str, str | int], int | float]()
 
     @property
     def counters(self) -> Counters:
@@ -185,8 +185,8 @@ class _RecordedService:
 
     def _call(self, method: Literal["start", "tick", "stop"], now_ns: int) -> None:
         """Tells the service the figures of its loop, as a replay does, and calls it."""
-        before, self._told = self._told, recording_file.figures_of(self._loop)
-        changed = [(*at, value) for at, value in self._told.items() if before.get(at) != value]
+        before, self._recorded = self._recorded, recording_file.figures_of(self._loop)
+        changed = [(*at, value) for at, value in self._recorded.items() if before.get(at) != value]
         recording_file.set_figures(self._service.counters, changed)
         with self._recording.call(recording_file.Called(now_ns, method, changed)):
             getattr(self._service, method)(now_ns)

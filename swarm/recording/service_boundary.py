@@ -170,11 +170,11 @@ class BoundaryBus:
         self._bus.publish(topic, message, **fields)
 
     def subscribe(self, topic: Topic, post: Post, *, every_s: float = 0.0, **fields: str | int) -> None:
-        self._says("subscribe", topic, fields, f" every_s={every_s:g}")
+        self._record_call("subscribe", topic, fields, f" every_s={every_s:g}")
         self._bus.subscribe(topic, post, every_s=every_s, **fields)
 
     def collect(self, topic: Topic, **fields: str | int) -> None:
-        self._says("collect", topic, fields)
+        self._record_call("collect", topic, fields)
         self._bus.collect(topic, **fields)
 
     def gather(self) -> None:
@@ -208,15 +208,15 @@ class BoundaryBus:
         return [(key, decode(each, topic.message)) for key, each in unpack(content, list[tuple[kind, bytes]])]
 
     def unsubscribe(self, topic: Topic, **fields: str | int) -> None:
-        self._says("unsubscribe", topic, fields)
+        self._record_call("unsubscribe", topic, fields)
         self._bus.unsubscribe(topic, **fields)
 
     def serve(self, topic: Topic, post: Post, **fields: str | int) -> None:
-        self._says("serve", topic, fields)
+        self._record_call("serve", topic, fields)
         self._bus.serve(topic, post, **fields)
 
     def unserve(self, topic: Topic, **fields: str | int) -> None:
-        self._says("unserve", topic, fields)
+        self._record_call("unserve", topic, fields)
         self._bus.unserve(topic, **fields)
 
     def ask(
@@ -241,7 +241,7 @@ class BoundaryBus:
     def close(self) -> None:
         self._bus.close()
 
-    def _says(self, what: str, topic: Topic, fields: Mapping[str, str | int], how: str = "") -> None:
+    def _record_call(self, what: str, topic: Topic, fields: Mapping[str, str | int], how: str = "") -> None:
         self._crossing.let_out(f"{what} {topic.below(topic.every(fields))}{how}", b"")
 
 

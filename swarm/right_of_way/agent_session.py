@@ -61,7 +61,7 @@ _ASK_RARELY_NS = 30 * NS_PER_S
 """Interval of recovery queries to agents: a second, then twice as long each time, up to this."""
 _PROMISE_TIMEOUT_S = 10.0
 """A late member replies late, and its promise counts until we claim again: by epoch, so it does no harm."""
-_MOST_REFUSALS_TOLD = 100
+_MOST_REFUSALS = 100
 """Liars may say as many different things as they like."""
 _MOST_DIGITS = 9
 """Digits of a shard's number in a key, and of a certificate's."""
@@ -105,11 +105,11 @@ class RightOfWaySync:
     """Agent -> number of its newest revoked certificate."""
     _refused: set[str] = field(default_factory=set)
     _unled_due_ns: dict[int, int] = field(default_factory=dict)
-    """Shard which had no leader -> from when on that is said again."""
+    """Shard which had no leader -> from when on the warning is repeated."""
     _reserve_due_ns: int = 0
     _slow_due_ns: int = 0
-    _told_silent_ns: int | None = None
-    """Time when it was last said that our seats are silent; None while they are not."""
+    _silent_ns: int | None = None
+    """Time of the last warning that our seats are silent; None while they are not."""
 
     def __post_init__(self) -> None:
         setup = self.setup
@@ -211,12 +211,12 @@ class RightOfWaySync:
         waited = asked_ns is None or not 0 <= now_ns - asked_ns < _FIRST_ANSWERS_NS
         if waited and not self.core.settled and (self._unasked or now_ns >= self._ask_due_ns):
             self._ask_known(now_ns)
-        self._look_after_store(now_ns)
+        self._check_store(now_ns)
         if waited and asked_ns is not None:
             self._begin()
         self._take_standings(now_ns)
         self._perform(self.core.tick(requests, own_ns))
-        self._tell_slow(now_ns)
+        self._warn_slow(now_ns)
         for shard, text in self.core.host.unled(own_ns).items():
             if now_ns >= self._unled_due_ns.get(shard, now_ns):
                 self._unled_due_ns[shard] = now_ns + _WAITING_AGAIN_NS
@@ -226,7 +226,7 @@ class RightOfWaySync:
         for heard in self.bus.collected(HOST_STATE):
             self.hear(heard.message, now_ns)
 
-    def _tell_slow(self, now_ns: int) -> None:
+    def _warn_slow(self, now_ns: int) -> None:
         """States which agents answer so late, for some seconds on end, that vehicles wait longer for cells."""
         slow = self.core.trips.slow()
         if not slow:
@@ -241,19 +241,19 @@ class RightOfWaySync:
                 "for cells, and a failed agent is replaced later",
             )
 
-    def _look_after_store(self, now_ns: int) -> None:
+    def _check_store(self, now_ns: int) -> None:
         """Stops a member that cannot file promises, notes it, and lets it act again when there is space."""
         if now_ns >= self._reserve_due_ns:
             self._reserve_due_ns = now_ns + _RESERVE_NS
             self._take_revoked(now_ns)
             why = self.store.reserve()
-            told = self._told_silent_ns
+            since = self._silent_ns
             if self.store.ready:
-                if told is not None:
-                    self._told_silent_ns = None
+                if since is not None:
+                    self._silent_ns = None
                     self.warn("promises", "promises can be written again: this agent votes on right of way again")
-            elif told is None or now_ns - told >= _SILENT_AGAIN_NS:
-                self._told_silent_ns = now_ns
+            elif since is None or now_ns - since >= _SILENT_AGAIN_NS:
+                self._silent_ns = now_ns
                 self.warn("promises", f"{why}; this agent does not vote on right of way until there is space")
         self.core.silent = not self.store.ready
 
@@ -309,7 +309,7 @@ class RightOfWaySync:
                 case _:
                     self._perform([action])
 
-    def _tell_members(self, topic: Topic, message: traffic.Table | traffic.Stored) -> None:
+    def _send_to_members(self, topic: Topic, message: traffic.Table | traffic.Stored) -> None:
         """Sends a message to each other member of the shard."""
         for member in self.core.shards.members(message.shard):
             if member != self._id:
@@ -339,9 +339,9 @@ class RightOfWaySync:
                 case traffic.Word():
                     self.bus.publish(WORD, action, shard=action.shard, host=action.host, agent=self._id)
                 case traffic.Table():
-                    self._tell_members(TABLE, action)
+                    self._send_to_members(TABLE, action)
                 case traffic.Stored():
-                    self._tell_members(STORED, action)
+                    self._send_to_members(STORED, action)
                 case AskPromises(shard, epoch, members):
                     for member in members:
                         tag = f"promise-{shard}-{epoch}"
@@ -349,6 +349,6 @@ class RightOfWaySync:
                         seats: dict[str, str | int] = {"shard": shard, "member": self._id, "agent": member}
                         self.bus.ask(TABLE, claim, self.post, tag=tag, timeout_s=_PROMISE_TIMEOUT_S, **seats)
                 case Refused(text):
-                    if text not in self._refused and len(self._refused) < _MOST_REFUSALS_TOLD:
+                    if text not in self._refused and len(self._refused) < _MOST_REFUSALS:
                         self._refused.add(text)
                         self.warn("refused", text)

@@ -62,7 +62,7 @@ class ExternalService:
     post: Post
     warn: Callable[[str], None]
     external: ExternalVehicle | None = None
-    """None until an agent has said which agents there are."""
+    """None until an agent has sent the list of agents."""
     _warned: set[str] = field(default_factory=set)
     _tag: str = ""
     _asking: bool = False
@@ -448,9 +448,9 @@ def say_gone(bus: Bus, name: str, grid: GridSpec, timeout_s: float) -> bool:
                 pass
         if removal is not None and begun and now_ns >= due_ns:
             due_ns = now_ns + int(_TICK_S * NS_PER_S)
-            for told in removal.tick(now_ns):
-                for member in told.members:
-                    bus.publish(HOST_STATE, told.state, shard=told.state.shard, member=member, agent=name)
+            for statement in removal.tick(now_ns):
+                for member in statement.members:
+                    bus.publish(HOST_STATE, statement.state, shard=statement.state.shard, member=member, agent=name)
             if removal.done:
                 return True
     return False

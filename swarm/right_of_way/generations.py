@@ -26,9 +26,9 @@ _FURTHEST_GENERATION = 1 << 16
 """Restarts of a host beyond the known number, which no host reaches in a run."""
 
 
-def is_said(says: object, told: object, age_ns: int, again_ns: int = HEARTBEAT_NS) -> bool:
-    """Returns True if the same was told so recently that it need not be repeated yet."""
-    return says == told and 0 <= age_ns < again_ns
+def was_just_sent(news: object, sent: object, age_ns: int, again_ns: int = HEARTBEAT_NS) -> bool:
+    """Returns True if the same was sent so recently that it need not be repeated yet."""
+    return news == sent and 0 <= age_ns < again_ns
 
 
 def keep_last(kept: dict[_K, _V], key: _K, value: _V, most: int) -> None:

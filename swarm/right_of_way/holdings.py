@@ -10,7 +10,7 @@ from itertools import chain, takewhile
 
 import msgspec
 
-from swarm.right_of_way.generations import FURTHEST_EPOCH, HEARTBEAT_NS, is_said, keep_last
+from swarm.right_of_way.generations import FURTHEST_EPOCH, HEARTBEAT_NS, keep_last, was_just_sent
 from swarm.right_of_way.host_entries import BEFORE_ALL, HostEntries
 from swarm.right_of_way.shards import Shards
 from swarm.wire.messages.traffic import (
@@ -60,8 +60,8 @@ _NO_REQUEST = CellRequest()
 def part_of(generation: int, grants: Mapping[str, Held], waits: Mapping[str, Sequence[Entry]]) -> int:
     """Returns a digest of what a table grants to one generation of a host. 62 bits fit into a message, and an
     attacker has under a second to find other grants with the same digest."""
-    said = msgspec.msgpack.encode((generation, sorted(grants.items()), sorted(waits.items())))
-    return int.from_bytes(blake2b(said, digest_size=8).digest()) >> 2
+    table = msgspec.msgpack.encode((generation, sorted(grants.items()), sorted(waits.items())))
+    return int.from_bytes(blake2b(table, digest_size=8).digest()) >> 2
 
 
 @dataclass(frozen=True, slots=True)
@@ -72,7 +72,7 @@ class Tell:
     state: HostState
 
 
-_Told = tuple[Stand, object]
+_StandNews = tuple[Stand, object]
 """A stand, and what of it is news."""
 
 
@@ -84,7 +84,7 @@ class _View:
     heard     the newest host state of ours that the table in use takes into account
     seen      vehicle -> its entries in the table in use, and `waits` those of them that wait there
     followed  host -> entries of ours behind which its vehicles wait, by the same table; we may be that host
-    left      other host -> those of these that are over, as we told it last, and when
+    left      other host -> those of these that are over, as we sent it last, and when
     pushed    vehicle -> the age with which it is to make way into another shard
     others    cells beside our vehicles that are granted to vehicles of other hosts, or to none
     quiet     the first host state from which on we want nothing here; None while we do
@@ -92,7 +92,7 @@ class _View:
               older one that comes late does no harm: no entry is taken that a used table could have granted
     pending   leader -> its last grant, until a majority has the same on file, and its digest
     stands    vehicle that has a place -> the last statement about it
-    told      what was news of the last statement about our vehicles, and its time
+    news      what was news of the last statement about our vehicles; `sent_ns` is its time
     same      whether the next statement is known to be the same
     sent      seq -> host state, the last ones since the leader's first grant: it has that which it has `heard`.
               Empty if leaders read no changes of ours
@@ -111,15 +111,15 @@ class _View:
     quiet: int | None = None
     words: dict[str, tuple[int, int]] = field(default_factory=dict)
     pending: dict[str, tuple[Granted, int]] = field(default_factory=dict)
-    stands: dict[str, _Told] = field(default_factory=dict)
-    told: object = None
-    told_ns: int = 0
+    stands: dict[str, _StandNews] = field(default_factory=dict)
+    news: object = None
+    sent_ns: int = 0
     same: bool = False
     sent: dict[int, HostState] = field(default_factory=dict)
     used: dict[Stamp, Granted] = field(default_factory=dict)
 
 
-class _Said(msgspec.Struct, frozen=True):
+class _Statement(msgspec.Struct, frozen=True):
     """Statement about one vehicle, and the shards to which it was made."""
 
     request: CellRequest
@@ -163,7 +163,7 @@ class Holdings:
         self._pushed: dict[str, int] | None = None
         """Vehicle -> the age with which it is asked to make way; None: to be collected again, since a leader has
         spoken."""
-        self._said: dict[str, _Said] = {}
+        self._statements: dict[str, _Statement] = {}
         self._seen_anew: set[str] = set()
         """Vehicles to which another table grants other cells: their requests may change."""
         self._views: dict[int, _View] = {}
@@ -261,8 +261,8 @@ class Holdings:
         """It stands nowhere any more: give back all that it holds."""
         self._entries.leave(vehicle)
         self._paths.pop(vehicle, None)
-        said = self._said.pop(vehicle, None)
-        for shard in () if said is None else said.shards:
+        statement = self._statements.pop(vehicle, None)
+        for shard in () if statement is None else statement.shards:
             del self._views[shard].stands[vehicle]
             self._views[shard].same = False
 
@@ -329,7 +329,7 @@ class Holdings:
             begun = entries.paths.keys() | entries.bodies.keys() | entries.away
             if begun.issuperset(self._vehicles or ()):
                 entries.disclaim(word.shard, word.agent, (word.epoch, word.seq), word.lacks)
-            view.same, view.told = False, None
+            view.same, view.news = False, None
         return self._take_agreed(view)
 
     def _take_agreed(self, view: _View) -> list[str]:
@@ -349,7 +349,7 @@ class Holdings:
         self.newest = max(self.newest, granted.generation)
         if granted.generation > self.generation and not self.replaced:
             self.replaced = True
-            self._say_all_again()
+            self._restate_all()
         if granted.stamp == knows or granted.generation != self.generation or self.replaced:
             return []  # what it grants was granted to another generation
         if granted.epoch != knows[0]:
@@ -408,28 +408,28 @@ class Holdings:
         if not self.generation:
             return []
         self._seq += 1
-        self._say_changed(requests)
+        self._restate_changed(requests)
         concerned = {**self.watched, **{shard: None for shard, view in self._views.items() if view.stands}}
         by_shard = {shard: {**self._views[shard].stands} for shard in concerned}
         entries = self._entries
         for vehicle, cell in entries.bodies.items():
             if vehicle not in entries.paths:
-                self._say_entering(
+                self._add_entering(
                     by_shard, self.shards.of(cell), Stand(vehicle, cell, cell, Held(), [cell], [], 0, 0)
                 )
         for vehicle, path in entries.paths.items():
             if vehicle not in self._paths:
                 cell, end = path[0].cell, path[-1].cell
                 for shard, held in entries.of(vehicle).items():
-                    self._say_entering(by_shard, shard, Stand(vehicle, cell, end, Held.of(held), [], [cell], 1, 0))
+                    self._add_entering(by_shard, shard, Stand(vehicle, cell, end, Held.of(held), [], [cell], 1, 0))
         self._forget_left(by_shard)
         return [
-            self._tell(shard, [stand for stand, _ in stands.values()], now_ns)
+            self._host_state(shard, [stand for stand, _ in stands.values()], now_ns)
             for shard, stands in by_shard.items()
             if self._is_news(shard, stands, now_ns)
         ]
 
-    def _say_entering(self, by_shard: dict[int, dict[str, _Told]], shard: int, stand: Stand) -> None:
+    def _add_entering(self, by_shard: dict[int, dict[str, _StandNews]], shard: int, stand: Stand) -> None:
         """Adds a vehicle which is in no cell yet to the statements for a shard."""
         by_shard.setdefault(shard, {})[stand.vehicle] = stand, stand
         self._views.setdefault(shard, _View()).same = False
@@ -443,44 +443,44 @@ class Holdings:
             for host, numbers in view.followed.items():
                 if host == self.name:
                     continue
-                told, told_ns = view.left.get(host, (None, 0))
+                sent, sent_ns = view.left.get(host, (None, 0))
                 left = [number for number in numbers if number in over]
-                if left and not is_said(left, told, now_ns - told_ns):
+                if left and not was_just_sent(left, sent, now_ns - sent_ns):
                     view.left[host] = left, now_ns
                     words.setdefault(host, []).extend(left)
         return [Left(agent=self.name, host=host, entries=numbers) for host, numbers in words.items()]
 
-    def _say_changed(self, requests: Mapping[str, CellRequest]) -> None:
+    def _restate_changed(self, requests: Mapping[str, CellRequest]) -> None:
         """Renews the statement about each placed vehicle whose path, request or granted cells have changed."""
         anew, self._seen_anew = self._seen_anew, set()
         for vehicle, path in self._paths.items():
-            before, request = self._said.get(vehicle), requests.get(vehicle, _NO_REQUEST)
+            before, request = self._statements.get(vehicle), requests.get(vehicle, _NO_REQUEST)
             if (
                 before is None
                 or before.request is not request
                 or not (before.path is path or self._is_no_news(before, path))
                 or vehicle in anew
             ):
-                said = self._said[vehicle] = self._say(vehicle, path, request)
+                statement = self._statements[vehicle] = self._state_vehicle(vehicle, path, request)
                 before_at = set[int]() if before is None else before.shards
-                if before_at != said.shards:
-                    self._say_all_again()
-                for shard in before_at - said.shards:
+                if before_at != statement.shards:
+                    self._restate_all()
+                for shard in before_at - statement.shards:
                     del self._views[shard].stands[vehicle]
 
-    def _is_no_news(self, said: _Said, path: list[int]) -> bool:
+    def _is_no_news(self, statement: _Statement, path: list[int]) -> bool:
         """Returns True if a vehicle has only driven on, out of cells for which none waits, and has as many ahead as
         it keeps."""
-        left = len(said.path) - len(path)
-        drove = left > 0 and len(path) > self.keeps and said.path[left:] == path
-        return drove and self._followed.isdisjoint(said.held[:left])
+        left = len(statement.path) - len(path)
+        drove = left > 0 and len(path) > self.keeps and statement.path[left:] == path
+        return drove and self._followed.isdisjoint(statement.held[:left])
 
-    def _say_all_again(self) -> None:
+    def _restate_all(self) -> None:
         """Statements of all shards may change."""
         for view in self._views.values():
             view.same = False
 
-    def _tell(self, shard: int, stands: list[Stand], now_ns: int) -> Tell:
+    def _host_state(self, shard: int, stands: list[Stand], now_ns: int) -> Tell:
         """Returns the statement about these, for one leader as changes since one that it has."""
         view, members = self._views[shard], self._listeners(shard, now_ns)
         state = HostState(
@@ -505,23 +505,23 @@ class Holdings:
             return (view.leader,)
         return self.shards.members(shard)
 
-    def _is_news(self, shard: int, stands: Mapping[str, _Told], now_ns: int) -> bool:
+    def _is_news(self, shard: int, stands: Mapping[str, _StandNews], now_ns: int) -> bool:
         view = self._views[shard]
-        lately = 0 <= now_ns - view.told_ns < HEARTBEAT_NS
+        lately = 0 <= now_ns - view.sent_ns < HEARTBEAT_NS
         if not view.same:
             # An entry that we do not hold is freed only if we state so, knowing that table.
             in_step = view.seen == {id: stand.holds for id, (stand, _) in stands.items() if stand.holds}
             stamp = self._entries.knows.get(shard, BEFORE_ALL)
             knows = stamp[0] if in_step else stamp
-            told = (self.replaced, knows, [news for _, news in stands.values()])
-            lately = lately and told == view.told
-            view.told, view.same = told, True
+            news = (self.replaced, knows, [each for _, each in stands.values()])
+            lately = lately and news == view.news
+            view.news, view.same = news, True
         if lately:
             return False
-        view.told_ns = now_ns
+        view.sent_ns = now_ns
         return True
 
-    def _say(self, vehicle: str, path: list[int], request: CellRequest) -> _Said:
+    def _state_vehicle(self, vehicle: str, path: list[int], request: CellRequest) -> _Statement:
         """States a vehicle to each shard that it is near."""
         ahead, wants, better = [*request.ahead], list[int](), 0
         if len(path) == 1:
@@ -538,9 +538,9 @@ class Holdings:
             view = self._views.setdefault(shard, _View())
             view.same = False
             view.stands[vehicle] = stand, (vehicle, path[0], holds, ahead, better)
-        return _Said(request, path, held, near)
+        return _Statement(request, path, held, near)
 
-    def _forget_left(self, by_shard: Mapping[int, Mapping[str, _Told]]) -> None:
+    def _forget_left(self, by_shard: Mapping[int, Mapping[str, _StandNews]]) -> None:
         """Leaves the shards where we hold and want nothing, once their tables show that they know it."""
         for shard, stands in by_shard.items():
             view = self._views.setdefault(shard, _View())

@@ -30,7 +30,7 @@ from swarm.config.scenario import agent_of
 from swarm.wire.messages.traffic import Before, Entry, Number, Stamp
 
 _MOST_HEARD = 1 << 13
-"""Entries of others that are remembered as over; each is told again until a table lists it no more."""
+"""Entries of others that are remembered as over; each is sent again until a table lists it no more."""
 _MOST_DISCLAIMED = 1 << 8
 """Entries of a shard that one member may ask for: more than tables that lost can have granted to a host, and a liar
 fills no other member's share."""

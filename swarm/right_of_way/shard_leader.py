@@ -17,7 +17,7 @@ from zlib import crc32
 from swarm.clock import NS_PER_S
 from swarm.config.scenario import agent_of
 from swarm.right_of_way.cell_orders import Orders, cells_beside
-from swarm.right_of_way.generations import HEARTBEAT_NS, is_far_ahead, is_said, keep_last
+from swarm.right_of_way.generations import HEARTBEAT_NS, is_far_ahead, keep_last, was_just_sent
 from swarm.right_of_way.holdings import STATES_KEPT, TABLES_KEPT
 from swarm.right_of_way.host import GENERATIONS_KEPT
 from swarm.right_of_way.pibt import Mover, Round
@@ -29,7 +29,7 @@ SILENT_NS = NS_PER_S
 _AGE_BITS = 12
 """Ages are compared in steps of 4 s: two leaders hear the same two at different times, and have to agree which is
 the older most of the time, or each lets its own wait for the other (docs/design/right-of-way.md)."""
-_TOLD_AGAIN_NS = 3 * HEARTBEAT_NS // 4
+_GRANT_AGAIN_NS = 3 * HEARTBEAT_NS // 4
 """Interval at which an unchanged grant is repeated: somewhat less than a heartbeat, so that a heartbeat carries
 it."""
 MOST_EXTERNALS = 256
@@ -80,14 +80,14 @@ def _lot(vehicle: str, step: int) -> int:
 class _Host:
     """Known state of a host.
 
-    state     the newest of its newest generation, and when it came; None if none counts
-    stands    of that, vehicle -> its stand, for vehicles that the host may speak for
-    asking    those of them that are at rest, or request more than they are granted; other vehicles under way
-              request nothing now
-    spoke_ns  time of the last message, of any of its generations: a replaced one is informed
-    told      the last grant to it, and its time
-    said      (generation, seq) -> statement, the last ones, if changes of them are read
-    changes   whether the newest was sent as changes: then so are grants
+    state       the newest of its newest generation, and when it came; None if none counts
+    stands      of that, vehicle -> its stand, for vehicles that the host may speak for
+    asking      those of them that are at rest, or request more than they are granted; other vehicles under way
+                request nothing now
+    spoke_ns    time of the last message, of any of its generations: a replaced one is informed
+    sent        the last grant to it; `sent_ns` is its time
+    statements  (generation, seq) -> statement, the last ones, if changes of them are read
+    changes     whether the newest was sent as changes: then so are grants
     """
 
     spoke_ns: int
@@ -95,9 +95,9 @@ class _Host:
     stands: dict[str, Stand] = field(default_factory=dict)
     asking: Sequence[Stand] = ()
     heard_ns: int = 0
-    told: object = None
-    told_ns: int = 0
-    said: dict[Stamp, HostState] = field(default_factory=dict)
+    sent: object = None
+    sent_ns: int = 0
+    statements: dict[Stamp, HostState] = field(default_factory=dict)
     changes: bool = False
 
 
@@ -132,12 +132,12 @@ class Leader:
         """Vehicle -> its stand, by the hosts that have spoken lately."""
         self._granted = True  # since the last table: something that a host waits for
         self._changed = False  # or anything else
-        self._told: Table | None = None
-        self._told_ns = 0
+        self._table: Table | None = None
+        self._table_ns = 0
         self._content: dict[Stamp, dict[str, tuple[Granted, object]]] = {}
         """Stamp of a table -> as `_content_of` it."""
-        self._said_of: Stamp | None = None
-        self._said_ns = 0
+        self._granted_stamp: Stamp | None = None
+        self._granted_ns = 0
 
     @property
     def _next_stamp(self) -> Stamp:
@@ -165,7 +165,7 @@ class Leader:
         if (state.generation, state.seq) <= (generation, seq):
             return
         known.changes = state.since > 0
-        if (whole := state.whole(known.said)) is None:
+        if (whole := state.whole(known.statements)) is None:
             return
         state = whole
         if is_far_ahead(state.generation, generation):
@@ -176,7 +176,7 @@ class Leader:
             self.refused.append(f"{host} has {len(fenced)} generations here which are not known to have ended")
             return
         if state.generation != generation:
-            known.told = None
+            known.sent = None
             self.seq += 1  # two generations of one tick are given different entries
         if not state.vehicles and (known.state is None or known.state.vehicles):
             self._changed = True  # it leaves the shard as soon as a table counts this
@@ -191,7 +191,7 @@ class Leader:
         self.seq = max(self.seq, self._orders.newest - 1)  # the next table is not older than its entries
         known.state, known.stands, known.heard_ns = state, stands, now_ns
         if self._shards.reads_changes(host):
-            keep_last(known.said, (state.generation, state.seq), state, STATES_KEPT)
+            keep_last(known.statements, (state.generation, state.seq), state, STATES_KEPT)
         known.asking = [stand for stand in stands.values() if stand.ahead or stand.cell == stand.end]
 
     def _is_welcome(self, host: str) -> bool:
@@ -215,28 +215,28 @@ class Leader:
         """Grants all possible requests. Returns the table if a host waits for a change in it, or once in a
         heartbeat: the same as before if it is unchanged."""
         self._plan(now_ns)
-        if not self._granted and now_ns - self._told_ns < HEARTBEAT_NS:
+        if not self._granted and now_ns - self._table_ns < HEARTBEAT_NS:
             return None
-        if self._told is None or self._granted or self._changed:
+        if self._table is None or self._granted or self._changed:
             self.seq += 1
             stamp = self.epoch, self.seq
-            self._told = self._orders.table(self._shard, self._me, stamp, self._pushed, self._without)
-            keep_last(self._content, stamp, self._content_of(self._told), TABLES_KEPT)
+            self._table = self._orders.table(self._shard, self._me, stamp, self._pushed, self._without)
+            keep_last(self._content, stamp, self._content_of(self._table), TABLES_KEPT)
         self._changed = self._granted = False
-        self._told_ns = now_ns
-        return self._told
+        self._table_ns = now_ns
+        return self._table
 
     def granted(self, table: Table, now_ns: int) -> Iterator[Granted]:
-        """Returns the table's content for each host that has spoken lately, if it is new or `_TOLD_AGAIN_NS` have
+        """Returns the table's content for each host that has spoken lately, if it is new or `_GRANT_AGAIN_NS` have
         passed since the last message."""
-        if is_said(table.stamp, self._said_of, now_ns - self._said_ns, _TOLD_AGAIN_NS):
+        if was_just_sent(table.stamp, self._granted_stamp, now_ns - self._granted_ns, _GRANT_AGAIN_NS):
             return
-        self._said_of, self._said_ns = table.stamp, now_ns
+        self._granted_stamp, self._granted_ns = table.stamp, now_ns
         for name, (granted, news) in self._content.get(table.stamp, {}).items():
             host = self._hosts[name]
             silent = now_ns - host.spoke_ns > SILENT_NS
-            if not silent and not is_said(news, host.told, now_ns - host.told_ns, _TOLD_AGAIN_NS):
-                host.told, host.told_ns = news, now_ns
+            if not silent and not was_just_sent(news, host.sent, now_ns - host.sent_ns, _GRANT_AGAIN_NS):
+                host.sent, host.sent_ns = news, now_ns
                 yield self._since_used(granted, host)
 
     def _since_used(self, granted: Granted, host: _Host) -> Granted:

@@ -38,7 +38,7 @@ SLOW_NS = 3 * NS_PER_S // 10
 _ASKED_KEPT = 16
 """Tables and claims of which it is kept when they were sent."""
 _BASES_KEPT = 8
-"""Tables on file from which changes can be told: on links so slow that members are further behind, tables come
+"""Tables on file from which changes can be sent: on links so slow that members are further behind, tables come
 whole."""
 
 
@@ -61,7 +61,7 @@ class AskPromises:
 
 @dataclass(frozen=True, slots=True)
 class Refused:
-    """Something was said that cannot be true."""
+    """A message states what cannot be true."""
 
     text: str
 
@@ -137,13 +137,13 @@ class Member:
         self._wanted_ns = now_ns - _WANTED_NS - 1
         self._acked_ns = dict.fromkeys(self._others, now_ns)
         """Other member -> when it acknowledged our claim or table last."""
-        self._told: list[Table] = []
+        self._published: list[Table] = []
         """Tables published as leader, the oldest first, from the newest one that is on file on."""
-        self._said = self._other_said = (0, 0)
-        """Stamps of the newest tables that we, and the third member, said to have stored."""
-        self._said_ns = now_ns
+        self._confirmed = self._other_confirmed = (0, 0)
+        """Stamps of the newest tables that we, and the third member, confirmed as stored."""
+        self._confirmed_ns = now_ns
         self._has: dict[str, tuple[Stamp, int]] = {}
-        """Other member -> the table that it said last to have stored, and when."""
+        """Other member -> the table that it confirmed last, and when."""
         self._bases = {self.stored.stamp: self.stored}
         """Stamp -> table, of those that were stored last."""
 
@@ -163,7 +163,7 @@ class Member:
     @property
     def _lease_ns(self) -> int:
         """A leader speaks once a heartbeat; the table of a new one comes a round trip after our promise. A table
-        that is lost is told again after another."""
+        that is lost is sent again after another."""
         return max(LEASE_NS, HEARTBEAT_NS + 2 * (self._trips.bound_ns(self._trusted) + self._tick_ns))
 
     def _turn_ns(self) -> int:
@@ -241,17 +241,18 @@ class Member:
             actions.append(Save(self.promised, self.stored))
             actions += self._words(now_ns)
         if table.stamp == self.stored.stamp:
-            self._said = min(self._said, (table.epoch, table.seq - 1))  # a repeated table is acknowledged again
+            # A repeated table is acknowledged again.
+            self._confirmed = min(self._confirmed, (table.epoch, table.seq - 1))
             if self._shards.leader(self.shard, table.epoch + 1) == self._me:
-                actions.append(self._say(now_ns))
+                actions.append(self._confirm(now_ns))
         return actions
 
     def _store(self, table: Table) -> None:
         self.stored = table
         keep_last(self._bases, table.stamp, table, _BASES_KEPT)
 
-    def _say(self, now_ns: int) -> Stored:
-        self._said, self._said_ns = self.stored.stamp, now_ns
+    def _confirm(self, now_ns: int) -> Stored:
+        self._confirmed, self._confirmed_ns = self.stored.stamp, now_ns
         return self.on_file
 
     def _accepts(self, table: Table) -> bool:
@@ -273,16 +274,16 @@ class Member:
         """Returns our words to hosts, where these need more than the leader's."""
         return [] if self._witness is None else [*self._witness.words(self.stored, now_ns)]
 
-    def _say_late(self, now_ns: int) -> list[MemberAction]:
+    def _confirm_late(self, now_ns: int) -> list[MemberAction]:
         """Returns the reply of the member that is second after the leader about its file. With the leader the first
         one makes a majority, so the second says only what the first does not, and, as others may not hear the
         first, speaks at least once in a heartbeat."""
         stamp = self.stored.stamp
-        if self.leader is not None or self._said >= stamp:
+        if self.leader is not None or self._confirmed >= stamp:
             return []
-        if self._other_said >= stamp and now_ns - self._said_ns < HEARTBEAT_NS:
+        if self._other_confirmed >= stamp and now_ns - self._confirmed_ns < HEARTBEAT_NS:
             return []
-        return [self._say(now_ns)]
+        return [self._confirm(now_ns)]
 
     def hear_claim(self, epoch: int, now_ns: int) -> list[MemberAction]:
         """Promise, or say nothing. The last action is the table to answer with."""
@@ -309,7 +310,7 @@ class Member:
         if stored.agent not in self._others:
             return []
         self._has[stored.agent] = (stored.epoch, stored.seq), now_ns
-        self._other_said = max(self._other_said, (stored.epoch, stored.seq))
+        self._other_confirmed = max(self._other_confirmed, (stored.epoch, stored.seq))
         if self.leader is None:
             return []
         if stored.epoch == self.leader.epoch:
@@ -323,11 +324,11 @@ class Member:
 
     def _on_file(self, leader: Leader, seq: int, now_ns: int) -> list[MemberAction]:
         """Another member has stored the table of this number, or a later one: with ours that is a majority."""
-        while len(self._told) > 1 and self._told[1].seq <= seq:
-            del self._told[0]
-        if not self._told or self._told[0].seq > seq:
+        while len(self._published) > 1 and self._published[1].seq <= seq:
+            del self._published[0]
+        if not self._published or self._published[0].seq > seq:
             return []
-        return [*leader.granted(self._told[0], now_ns)]
+        return [*leader.granted(self._published[0], now_ns)]
 
     # --- being leader ---------------------------------------------------------------------------------------
 
@@ -336,7 +337,7 @@ class Member:
         if wanted and self.leader is not None and self._claim_above <= self.leader.epoch:
             return self._lead(self.leader, now_ns)
         if not wanted or (self.leader is None and now_ns < self._due_ns):
-            return [*self._say_late(now_ns), *self._words(now_ns)]
+            return [*self._confirm_late(now_ns), *self._words(now_ns)]
         return self._claim(now_ns)
 
     def _claim(self, now_ns: int) -> list[MemberAction]:
@@ -365,7 +366,7 @@ class Member:
             self._ask(table.stamp, now_ns)
             if table is not self.stored:
                 self._store(table)
-                self._told = [*self._told[-TABLES_KEPT:], table]
+                self._published = [*self._published[-TABLES_KEPT:], table]
                 actions.append(Save(self.promised, table))
             base = self._base(now_ns)
             actions.append(table if base is None or base.epoch != table.epoch else table.changes(base))
@@ -400,7 +401,7 @@ class Member:
             self.leader = Leader(
                 self._shards, self._me, self._claimed, found, self._fleets, self._revoked if distrusted else None
             )
-            self._told = []
+            self._published = []
             self._acked_ns = dict.fromkeys(self._others, now_ns)
             # Once in an epoch: a promise that is repeated after the leader has resigned must not restart it.
             self._claimed, self._promises = 0, {}

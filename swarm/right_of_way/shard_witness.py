@@ -16,7 +16,7 @@ from msgspec.structs import replace
 
 from swarm.config.scenario import agent_of
 from swarm.right_of_way.cell_orders import Orders
-from swarm.right_of_way.generations import is_said
+from swarm.right_of_way.generations import was_just_sent
 from swarm.right_of_way.holdings import part_of
 from swarm.right_of_way.host import GENERATIONS_KEPT
 from swarm.right_of_way.host_entries import BEFORE_ALL
@@ -65,7 +65,7 @@ def agreed(tables: Collection[Table]) -> Table:
             cells.add(place)
     hosts: dict[str, tuple[int, int]] = {}
     for table in newest_first:
-        hosts.update((name, max(said, hosts.get(name, said))) for name, said in table.hosts.items())
+        hosts.update((name, max(newest, hosts.get(name, newest))) for name, newest in table.hosts.items())
     entries: dict[tuple[str, int], dict[str, list[Number]]] = {}
     for number, vehicle in (each for each in counts if agreed_on.get(each[0]) == each[1]):
         host = agent_of(vehicle)
@@ -98,7 +98,7 @@ class _Host:
     there        (vehicle, cell) that its newest generation holds, or states a vehicle to be on -> whether it holds
                  an entry there
     ended        generations that have ended, the newest ones
-    told         the last word to it, and its time
+    sent         the last word to it; `sent_ns` is its time
     """
 
     spoke_ns: int
@@ -106,8 +106,8 @@ class _Host:
     generations: dict[int, tuple[Stamp, frozenset[Number], list[Number]]] = field(default_factory=dict)
     there: dict[tuple[str, int], bool] = field(default_factory=dict)
     ended: set[int] = field(default_factory=set)
-    told: object = None
-    told_ns: int = 0
+    sent: object = None
+    sent_ns: int = 0
 
     def hear(self, state: HostState, now_ns: int) -> None:
         self.spoke_ns = now_ns
@@ -183,8 +183,8 @@ class Witness:
             return False
         self._lacks = {
             host: []
-            for host, said in new.hosts.items()
-            if said != old.hosts.get(host) and (host not in self._hosts or said > self._hosts[host].newest)
+            for host, newest in new.hosts.items()
+            if newest != old.hosts.get(host) and (host not in self._hosts or newest > self._hosts[host].newest)
         }
         # A vehicle of which all generations have ended before a table counted one begins in its cell again.
         begins = {(number[0], each[0]) for number, each in added if number not in old_entries}
@@ -275,10 +275,10 @@ class Witness:
                 continue
             generation, _ = stored.hosts.get(name, BEFORE_ALL)
             part = part_of(generation, *self._orders.granted(name))
-            says = stored.epoch, part, lacks
-            if is_said(says, host.told, now_ns - host.told_ns):
+            news = stored.epoch, part, lacks
+            if was_just_sent(news, host.sent, now_ns - host.sent_ns):
                 continue
-            host.told, host.told_ns = says, now_ns
+            host.sent, host.sent_ns = news, now_ns
             yield Word(
                 shard=stored.shard,
                 host=name,

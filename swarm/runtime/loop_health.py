@@ -122,7 +122,7 @@ class Supervisor:
         self._address = address
         self._every_ns = None if limit_ns is None else limit_ns // _PINGS_PER_LIMIT
         self._due_ns = 0
-        self._told_ready = False
+        self._sent_ready = False
         self._status: str | None = None
         """Content of the next datagram; None: nothing new."""
         self._socket = None if address is None else _opened()
@@ -134,11 +134,11 @@ class Supervisor:
 
     def turned(self, now_ns: int) -> None:
         """The loop has turned: at the first time the process is up, at later ones it is still alive."""
-        words = [] if self._told_ready else ["READY=1"]
+        words = [] if self._sent_ready else ["READY=1"]
         if self._every_ns is not None and now_ns >= self._due_ns:
             words.append("WATCHDOG=1")
         if words and self._send(words):
-            self._told_ready = True
+            self._sent_ready = True
             self._due_ns = now_ns + (self._every_ns or 0)
 
     def ends(self) -> None:
@@ -262,7 +262,7 @@ class Health:
     def __init__(self, board: Board | None = None, supervisor: Supervisor | None = None) -> None:
         self.board = board or Board()
         self._supervisor = supervisor or Supervisor(None)
-        self._told = Vitals(0, 0, Phase.STARTS, ())
+        self._written = Vitals(0, 0, Phase.STARTS, ())
         self._limit_ns = 0
         self.starts("its start")
 
@@ -279,8 +279,8 @@ class Health:
         """The loop has ticked. `lacks`: as in `Vitals`."""
         now_ns = time.monotonic_ns()
         vitals = Vitals(now_ns, self._limit_ns, Phase.RUNS, tuple(lacks))
-        news = (vitals.phase, vitals.lacks) != (self._told.phase, self._told.lacks)
-        if news or now_ns - self._told.stamp_ns >= _WRITE_NS:
+        news = (vitals.phase, vitals.lacks) != (self._written.phase, self._written.lacks)
+        if news or now_ns - self._written.stamp_ns >= _WRITE_NS:
             self._write(vitals)
         if news:
             self._supervisor.says(f"waits for {', '.join(lacks)}" if lacks else "ready")
@@ -293,4 +293,4 @@ class Health:
 
     def _write(self, vitals: Vitals) -> None:
         self.board.write(vitals)
-        self._told = vitals
+        self._written = vitals

@@ -76,10 +76,10 @@ def checked(kind: type[Given], fields: Mapping[str, Any]) -> Given:
         given = plain({name: value for name, value in fields.items() if value is not None})
         return msgspec.convert({**given, "schema": schema_of_type(kind)}, kind)
     except (msgspec.ValidationError, ValueError, TypeError, OverflowError) as error:
-        said = str(error)
-        ours = not said.startswith(("Expected", "Invalid", "Object"))  # what fields say of each other
-        said = said.partition(" - at `$")[0] if ours else explain(said, given, kind)
-        raise ConfigError(f"the order is not possible: {said}") from None
+        text = str(error)
+        ours = not text.startswith(("Expected", "Invalid", "Object"))  # what fields say of each other
+        text = text.partition(" - at `$")[0] if ours else explain(text, given, kind)
+        raise ConfigError(f"the order is not possible: {text}") from None
 
 
 @dataclass(frozen=True)

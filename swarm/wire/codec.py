@@ -194,9 +194,9 @@ def _converted(fields: dict[Any, Any], message_type: type[M]) -> M:
 
 def field_fault(error: Exception, fields: Mapping[Any, Any], message_type: type[Message]) -> str:
     """Returns msgspec's fault of a field, as a sentence: its name, the value found and the value expected."""
-    said, _, place = str(error).replace("`key` in ", "").partition(" - at `$")
+    text, _, place = str(error).replace("`key` in ", "").partition(" - at `$")
     path = place.rstrip("`").lstrip(".")
-    expected = _in_words(said)
+    expected = _in_words(text)
     if not path:
         return (expected or type(error).__name__)[:300]
     found: Any = fields
@@ -205,17 +205,17 @@ def field_fault(error: Exception, fields: Mapping[Any, Any], message_type: type[
             found = found[int(index)] if index else found[name]
     except (LookupError, TypeError):  # a place in a mapping, which msgspec writes as [...]
         return f"{path}: {expected}"[:300]
-    if said.startswith("Invalid enum value"):
+    if text.startswith("Invalid enum value"):
         hint = _hints_of(message_type).get(path)
         words = [word for each in (hint, *typing.get_args(hint)) for word in typing.get_args(each)]
         expected = f"one of {', '.join(repr(word) for word in words if isinstance(word, str))}"
     return f"{path}: found {reprlib.repr(found)}, expected {expected}"[:300]
 
 
-def _in_words(said: str) -> str:
+def _in_words(text: str) -> str:
     """Returns what msgspec expected, such as "Expected `int | null` >= 0, got `str`", without names of types."""
-    said = said.replace(f"`str` matching regex {ID_PATTERN!r}", ID_WORDS)
-    before, _, rest = said.removeprefix("Expected ").partition(", got `")[0].partition("`")
+    text = text.replace(f"`str` matching regex {ID_PATTERN!r}", ID_WORDS)
+    before, _, rest = text.removeprefix("Expected ").partition(", got `")[0].partition("`")
     names, _, bound = rest.partition("`")
     return before + " or ".join(_KINDS.get(name, name) for name in names.split(" | ")) + bound
 
@@ -302,7 +302,7 @@ def packed_json(
     schema = given.pop("schema", schema_of_type(message_type))
     meant = {KEY_FIELD: given.pop(KEY_FIELD, key)} if key or KEY_FIELD in given else {}
     try:
-        fields = _turned(given, message_type, "", _packed_column)
+        fields = _recoded(given, message_type, "", _packed_column)
         packed: bytes = msgpack.packb({"schema": schema} | fields | meant)
     except ProtocolError:
         raise
@@ -329,7 +329,7 @@ def _plain(struct: msgspec.Struct) -> Any:
     """The fields of a struct as JSON has them."""
     fields = msgspec.to_builtins(struct, builtin_types=_BYTES, str_keys=False)
     fields.pop("schema", None)
-    return _turned(fields, type(struct), "", _listed_column)
+    return _recoded(fields, type(struct), "", _listed_column)
 
 
 @cache
@@ -338,7 +338,7 @@ def _hints_of(struct: type[msgspec.Struct]) -> dict[str, Any]:
     return {name: hints[name] for name in struct.__struct_fields__}
 
 
-def _turned(value: Any, hint: Any, place: str, turn: Callable[[Any, Column, str], Any]) -> Any:
+def _recoded(value: Any, hint: Any, place: str, turn: Callable[[Any, Column, str], Any]) -> Any:
     """A value from MessagePack's form to JSON's or back, by its type. A value that does not fit the type stays as
     it is, for the decoder to refuse.
 
@@ -349,37 +349,37 @@ def _turned(value: Any, hint: Any, place: str, turn: Callable[[Any, Column, str]
     kind, args = typing.get_origin(bare) or bare, typing.get_args(bare)
     if kind in (types.UnionType, typing.Union):
         (one,) = (arg for arg in args if arg not in (types.NoneType, msgspec.UnsetType))
-        return None if value is None else _turned(value, one, place, turn)
+        return None if value is None else _recoded(value, one, place, turn)
     if kind is bytes:
         return turn(value, next((note for note in notes if isinstance(note, Column)), _BYTE_COLUMN), place)
     if kind is float and OR_INFINITE in notes:
         return _null_for_infinite(value) if turn is _listed_column else math.inf if value is None else value
     if kind is list and isinstance(value, list):
-        return [_turned(each, args[0], place, turn) for each in value]
+        return [_recoded(each, args[0], place, turn) for each in value]
     if kind is dict and isinstance(value, dict):
         numbered = turn is _packed_column and taken_apart(args[0])[0] is int  # JSON has texts for keys
         try:
             value = {int(key): each for key, each in value.items()} if numbered else value
         except ValueError as error:
             raise ProtocolError(f"{place} has a key that is no integer, such as 4") from error
-        return {key: _turned(each, args[1], place, turn) for key, each in value.items()}
+        return {key: _recoded(each, args[1], place, turn) for key, each in value.items()}
     if isinstance(kind, type) and issubclass(kind, msgspec.Struct):
-        return _turned_struct(value, kind, place, turn)
+        return _recoded_struct(value, kind, place, turn)
     return value
 
 
-def _turned_struct(value: Any, kind: type[msgspec.Struct], place: str, turn: Callable[..., Any]) -> Any:
+def _recoded_struct(value: Any, kind: type[msgspec.Struct], place: str, turn: Callable[..., Any]) -> Any:
     hints, dot = _hints_of(kind), f"{place}." if place else ""
     if kind.__struct_config__.array_like and isinstance(value, list | tuple):
         parts = zip(value, hints.items(), strict=False)
-        return [_turned(each, hint, dot + name, turn) for each, (name, hint) in parts] + list(value[len(hints) :])
+        return [_recoded(each, hint, dot + name, turn) for each, (name, hint) in parts] + list(value[len(hints) :])
     if not isinstance(value, dict):
         return value
     for name in value:
         if name not in hints:
             allowed = ", ".join(hints) or "no fields"
             raise ProtocolError(f"unknown field {dot}{name[:_QUOTED]!r}; {kind.__name__} has {allowed}")
-    return {name: _turned(each, hints[name], dot + name, turn) for name, each in value.items()}
+    return {name: _recoded(each, hints[name], dot + name, turn) for name, each in value.items()}
 
 
 _BYTE_COLUMN = Column("<u1")

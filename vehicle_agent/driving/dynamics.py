@@ -106,14 +106,14 @@ class Dynamics(Protocol):
         ...
 
 
-def dynamics_of(plugin: Plugin, world: DynamicsWorld, tell: Tell) -> PluginDynamics | None:
+def dynamics_of(plugin: Plugin, world: DynamicsWorld, report: Tell) -> PluginDynamics | None:
     """The dynamics that a scenario names; None, the default, if vehicles drive as the ground allows.
 
-    Raises ConfigError if they cannot be made; `tell` is called with a later fault.
+    Raises ConfigError if they cannot be made; `report` is called with a later fault.
     """
     if plugin.factory is None:
         return None
-    return PluginDynamics(plugin.make(world), world.grid, Guard(plugin, tell))
+    return PluginDynamics(plugin.make(world), world.grid, Guard(plugin, report))
 
 
 def own_dynamics(own: ClassConfig | None, world: DynamicsWorld) -> PluginDynamics | None:

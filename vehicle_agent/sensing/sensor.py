@@ -93,14 +93,14 @@ class TruthSensor:
         return Sight(seen, self._truth.reshape(-1)[seen])
 
 
-def sensor_of(plugin: Plugin, world: SensorWorld, tell: Tell) -> Sensor:
-    """The sensor that a scenario names. Raises ConfigError if it cannot be made; `tell` takes its later fault."""
+def sensor_of(plugin: Plugin, world: SensorWorld, report: Tell) -> Sensor:
+    """The sensor that a scenario names. Raises ConfigError if it cannot be made; `report` takes its later fault."""
     if plugin.factory is None:
         return TruthSensor(world.grid, world.truth_s_per_m, world.range_m)
     truth = world.truth_s_per_m.view()
     truth.flags.writeable = False
     world = SensorWorld(world.grid, truth, world.range_m, world.agent, world.seed)
-    return PluginSensor(plugin.make(world), world, Guard(plugin, tell))
+    return PluginSensor(plugin.make(world), world, Guard(plugin, report))
 
 
 class PluginSensor:

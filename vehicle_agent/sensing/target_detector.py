@@ -49,7 +49,7 @@ class TargetDetector:
         self._range_m = range_m
         self._true: dict[str, TargetPose] = {}
         self._newest = Newest(silence_ns=POSE_SILENCE_NS)
-        self._told_ns: dict[str, int] = {}
+        self._reported_ns: dict[str, int] = {}
         self._seq = 0
         self._last: dict[str, Sighted] = {}
         """Target -> its last sighting of all, if that is this author's."""
@@ -98,7 +98,7 @@ class TargetDetector:
 
     def detect(self, places: Places, now_ns: int) -> list[Sighted]:
         """The sightings to publish now: of each target in sight one, by the nearest vehicle."""
-        due = [id for id in self._true if now_ns - self._told_ns.get(id, -_TELL_NS) >= _TELL_NS]
+        due = [id for id in self._true if now_ns - self._reported_ns.get(id, -_TELL_NS) >= _TELL_NS]
         if not due or not places.vehicles:
             return []
         seen = []
@@ -107,7 +107,7 @@ class TargetDetector:
             east_m, south_m = pose.x_m - self._grid.west_m, self._grid.north_m - pose.y_m
             distance_m = float(np.hypot(places.east_m - east_m, places.south_m - south_m).min())
             if distance_m <= self._range_m:
-                self._told_ns[id] = now_ns
+                self._reported_ns[id] = now_ns
                 seen.append(self._sighted(pose, distance_m, now_ns))
         return seen
 

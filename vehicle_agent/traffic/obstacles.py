@@ -212,7 +212,7 @@ class Obstacles:
         self._closed: Counter[int] = Counter()
         """Cell -> by how many reports it is closed."""
         self._charged = 0
-        self._told: set[tuple[str, str]] = set()
+        self._warned: set[tuple[str, str]] = set()
         self._standing: set[int] | None = set()
         self._changed: list[Window] = []
         self._ticked_ns: int | None = None
@@ -328,8 +328,8 @@ class Obstacles:
     def _complain(self, kind: str, id: str, text: str) -> None:
         self.refused += 1
         about = kind, "" if kind == "crowded" else id  # a crowd has as many ids as it likes
-        if about not in self._told and len(self._told) < _MOST_TOLD:
-            self._told.add(about)
+        if about not in self._warned and len(self._warned) < _MOST_TOLD:
+            self._warned.add(about)
             self.complaints.append(f"obstacle {id} {text}")
 
     # --- time passes ----------------------------------------------------------------------------------------

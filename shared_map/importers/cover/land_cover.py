@@ -53,7 +53,7 @@ class Ground:
     name: str = ""
 
     @property
-    def shown(self) -> str:
+    def text(self) -> str:
         if self.kind != TerrainClass.UNKNOWN:
             return self.kind.name.lower()
         return "lethal" if math.isinf(self.factor) else f"pace x {self.factor:g}"
@@ -273,7 +273,7 @@ def _notes_on(
         raise TerrainError(f"{what}: {found}; terrain.cover_codes names another")
     most = sorted((code for code in there.tolist() if states[code] == 0), key=lambda code: -cells[code])
     names = {code: f"{code} {table.grounds[code].name}".strip() for code in most[:_LISTED_CODES]}
-    listed = [f"{name} {cells[at] / total:.1%} ({table.grounds[at].shown})" for at, name in names.items()]
+    listed = [f"{name} {cells[at] / total:.1%} ({table.grounds[at].text})" for at, name in names.items()]
     more = f" and {len(most) - _LISTED_CODES} more" if len(most) > _LISTED_CODES else ""
     yield f"land cover: {table.title}, {known_by}: {', '.join(listed) or 'none of its codes'}{more}"
     if strange:

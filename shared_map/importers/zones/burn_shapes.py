@@ -103,8 +103,8 @@ class Placing:
         if not self._touched:
             hint = "are x and y in reverse?" if self._reversed(self._reach[None])[0] else "is crs right?"
             raise TerrainError(
-                f"{what} does not touch the terrain: it reaches from {_shown(*self._reach)}, the terrain from"
-                f" {_shown(*self._box)} in {self._facts.crs}; {hint}"
+                f"{what} does not touch the terrain: it reaches from {_box_text(*self._reach)}, the terrain from"
+                f" {_box_text(*self._box)} in {self._facts.crs}; {hint}"
             )
 
     def _on(self, bounds: Floats64) -> NDArray[np.bool_]:
@@ -128,7 +128,7 @@ class Placing:
             wrong = (np.abs(bounds[:, ::2]).max(axis=1) > 540) | (np.abs(bounds[:, 1::2]).max(axis=1) > 90.0001)
             for n in np.flatnonzero(wrong)[:1]:
                 raise TerrainError(
-                    f"{what}: feature {features.id(features.of[n])} reaches from {_shown(*bounds[n])}, which"
+                    f"{what}: feature {features.id(features.of[n])} reaches from {_box_text(*bounds[n])}, which"
                     f" are no degrees, as {self._facts.crs} has them; set crs"
                 )
             for n in np.flatnonzero(bounds[:, 2] - bounds[:, 0] > 180):
@@ -185,7 +185,7 @@ class Placing:
         return shapes, of
 
 
-def _shown(west: float, south: float, east: float, north: float) -> str:
+def _box_text(west: float, south: float, east: float, north: float) -> str:
     return f"{west:.7g}, {south:.7g} to {east:.7g}, {north:.7g}"
 
 

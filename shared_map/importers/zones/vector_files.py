@@ -112,14 +112,14 @@ def open_layers(path: Path, layer: str | None, what: str) -> list[Layer]:
         known = [str(name) for name, shape in listed if shape is not None]
         if not known:
             raise TerrainError(f"{what} has no layer of shapes")
-        shown = ", ".join(known[:12]) + (" ..." if len(known) > 12 else "")
+        choices = ", ".join(known[:12]) + (" ..." if len(known) > 12 else "")
         if layer is not None and layer not in known:
-            raise TerrainError(f"{what} has no layer {layer!r}, only {shown}{nearest(layer, known)}")
+            raise TerrainError(f"{what} has no layer {layer!r}, only {choices}{nearest(layer, known)}")
         names = [layer] if layer is not None else known
         if layer is None and kind.driver in _TOGETHER:
             names = [name for name in known if name in _TOGETHER[kind.driver] or not _TOGETHER[kind.driver]]
         elif len(names) > 1:
-            raise TerrainError(f"{what} has {len(known)} layers; set layer to one of {shown}")
+            raise TerrainError(f"{what} has {len(known)} layers; set layer to one of {choices}")
         found = []
         for name in names:
             if kind.driver == "GPKG":  # a view is a program, which may not end
