@@ -123,7 +123,7 @@ class Agent:
         self.goals = GoalQueues(lambda cell: self._steering.steps(cell) if cell < grid.cells else (), grid.middle)
         self._goals_taken = -1
         """Version of the goals by which the vehicles go."""
-        self._look_due_ns = 0
+        self._forget_due_ns = 0
         self.detours = Detours(grid, pace, self._steering.steps, self.obstacles, climb)
         self._planners: dict[str, int] = {}
         self._poses: dict[str | None, TargetPose] = {}
@@ -171,10 +171,10 @@ class Agent:
         shared  cell -> how many vehicles of all agents were sent there, as in `GoalQueues`
         """
         goals = self.goals
-        if shared != goals.shared or now_ns >= self._look_due_ns:
-            self._look_due_ns = now_ns + NS_PER_S
+        if shared != goals.shared or now_ns >= self._forget_due_ns:
+            self._forget_due_ns = now_ns + NS_PER_S
             goals.shared = shared
-            goals.look_again()
+            goals.forget_arrivals()
         if not self.goals_taken:
             self._goals_taken = goals.book.version
             for vehicle in self.vehicles.values():
@@ -252,20 +252,20 @@ class Agent:
         """Vehicles which obstacles keep from driving anywhere."""
         return self._steering.shut_in & self.vehicles.keys()
 
-    def set_ways_out(self, ways_out: Mapping[int, int]) -> None:
+    def set_exit_steps(self, exit_steps: Mapping[int, int]) -> None:
         """Takes the terrain's cells closed only by an operator's zone, with the number of steps from each to its
         edge."""
-        self.seen_lethal.intersection_update(ways_out)
-        self._go_out(ways_out)
+        self.seen_lethal.intersection_update(exit_steps)
+        self._go_out(exit_steps)
 
-    def _go_out(self, ways_out: Mapping[int, int]) -> None:
-        ways_out = {cell: steps for cell, steps in ways_out.items() if cell not in self.seen_lethal}
-        if ways_out == self._steering.ways_out:
+    def _go_out(self, exit_steps: Mapping[int, int]) -> None:
+        exit_steps = {cell: steps for cell, steps in exit_steps.items() if cell not in self.seen_lethal}
+        if exit_steps == self._steering.exit_steps:
             return
-        self._steering.ways_out = ways_out
+        self._steering.exit_steps = exit_steps
         self._cell_requests.make_anew()
         for vehicle in self.vehicles.values():
-            if vehicle.terrain_cell in ways_out:  # a step along the way before this one is not allowed any more
+            if vehicle.terrain_cell in exit_steps:  # a step along the way before this one is not allowed any more
                 self._driver.end_path(vehicle)
 
     @property
@@ -304,12 +304,12 @@ class Agent:
             return None
         sight = self._sensor.look(list(dict.fromkeys(map(self.grid.terrain_cell, self._driver.entered))))
         self._driver.entered = {}
-        if ways_out := self._steering.ways_out:
+        if exit_steps := self._steering.exit_steps:
             # In a zone all is lethal by the map, so it cannot say which cells are so in truth.
             lethal = set(self._map.lethal(sight.cells, sight.paces).tolist())
-            if seen := lethal.intersection(ways_out):
+            if seen := lethal.intersection(exit_steps):
                 self.seen_lethal |= seen
-                self._go_out(ways_out)
+                self._go_out(exit_steps)
         return compare(sight, self._map.ground, self._map.prior)
 
     def take_driven(self) -> list[tuple[int, float]]:
@@ -375,7 +375,7 @@ class Agent:
         driven: list[Vehicle] = []
         paths, pushed, cell_requests = self.holdings.paths, self.holdings.pushed, self._cell_requests
         waiting = self._steering.waiting_ns
-        cell_requests.look_around(list(self.vehicles.values()))
+        cell_requests.drop_near_changes(list(self.vehicles.values()))
         for vehicle in self.vehicles.values():
             path, decided = paths[vehicle.id], vehicle.decided
             same = decided is not None and decided[0] is path and decided[1] == vehicle.route.version

@@ -179,11 +179,11 @@ _AGAIN_NS = NS_PER_S
 class ZonesAround:
     """The zones in an agent's map: those for all vehicles, and those for the class of its own.
 
-    ways_out  cell that only a zone closes -> straight steps from there to the nearest open cell
+    exit_steps  cell that only a zone closes -> straight steps from there to the nearest open cell
     """
 
     def __init__(self, replica: MapReplica, maps: AgentMaps) -> None:
-        self.ways_out: Mapping[int, int] = {}
+        self.exit_steps: Mapping[int, int] = {}
         self._replica = replica
         self._maps = maps
         self._cost_map = maps.own
@@ -207,10 +207,10 @@ class ZonesAround:
             self._due_ns = 0
         pace = self._cost_map.pace_s_per_m.reshape(-1)
         if not self._tiles or not np.isinf(pace[list(places)]).any():
-            self.ways_out = {}
-        elif now_ns >= self._due_ns or not self.ways_out:
+            self.exit_steps = {}
+        elif now_ns >= self._due_ns or not self.exit_steps:
             self._due_ns = now_ns + _AGAIN_NS
-            self.ways_out = self._find_ways_out(shut)
+            self.exit_steps = self._find_exit_steps(shut)
 
     def free(self, cells: NDArray[np.int64]) -> NDArray[np.bool_]:
         """Returns which cells are in no zone for all vehicles. There an operator's mark overrules findings; in a
@@ -235,7 +235,7 @@ class ZonesAround:
         grid = self._replica.grid
         return grid_cells(grid, tile_corners(grid, place), cells).astype(np.int64)
 
-    def _find_ways_out(self, shut: Collection[int]) -> dict[int, int]:
+    def _find_exit_steps(self, shut: Collection[int]) -> dict[int, int]:
         """Breadth first from the open cells around zones, along straight steps over cells that only zones close.
         Shut cells lead out too, as a vehicle may be there, but no path leads over them."""
         grid, pace, closed = self._replica.grid, self._cost_map.pace_s_per_m.reshape(-1), self._closed_by_zones()

@@ -77,7 +77,7 @@ class GoalQueues:
         self._steps, self._middle = steps, middle
         self._arrivals: dict[int, frozenset[int]] = {}
 
-    def look_again(self) -> None:
+    def forget_arrivals(self) -> None:
         """The ground, obstacles or shared places may have changed."""
         self._arrivals.clear()
 

@@ -225,7 +225,7 @@ class AgentService(MemberService):
             self._stand_down(now_ns)
         places = agent.places
         parts.zones.update(places, now_ns, agent.shut_ground)
-        agent.set_ways_out(parts.zones.ways_out)
+        agent.set_exit_steps(parts.zones.exit_steps)
         self._obey(now_ns)
         self._set_planners(now_ns)
         agent.map_changed(self._maps.take_dirty(), now_ns, by_others=True)

@@ -33,7 +33,7 @@ def check_pace(grid: GridSpec, pace: NDArray[np.float32]) -> None:
         raise ValueError("pace must be C-contiguous")
 
 
-def said_of_bad(pace: Floats, window: Window) -> str:
+def bad_pace_text(pace: Floats, window: Window) -> str:
     """Returns the sentence about the first cell of a window with an invalid pace."""
     part = pace[window.row0 : window.row1, window.col0 : window.col1]
     bad = np.argwhere(~(part > 0))
@@ -204,7 +204,7 @@ class CostGrid:
         """
         check_pace(self.grid, pace)
         if not (pace > 0).all():
-            raise ValueError(said_of_bad(pace, self.grid.window))
+            raise ValueError(bad_pace_text(pace, self.grid.window))
         cell_cost = self._padded(pace, self.length_weight_s)
         bounded = sum(np.count_nonzero(cell_cost == each) for each in (kernels.CHEAPEST_S, kernels.DEAREST_S))
         if bounded:
@@ -303,7 +303,7 @@ class CostGrid:
             return NO_CHANGES
         for row0, col0, row1, col1 in boxes:
             if not (pace[row0:row1, col0:col1] > 0).all():
-                raise ValueError(said_of_bad(pace, Window(row0, col0, row1, col1)))
+                raise ValueError(bad_pace_text(pace, Window(row0, col0, row1, col1)))
         # A cell in two overlapping windows changes in the first only, so there is no repetition.
         found = [self._taken(pace, box, self.length_weight_s, self.cell_cost) for box in boxes]
         if self._time_cost is not None:

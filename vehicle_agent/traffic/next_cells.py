@@ -59,7 +59,7 @@ class Steering:
 
     waiting_ns   vehicle -> the cell on which it waits, and since when; deleted when it may go on
     shut_in      vehicles that have stood for long on cells from which obstacles leave no step
-    ways_out     cell of the terrain that only an operator's zone closes -> steps from there out of it: a vehicle
+    exit_steps   cell of the terrain that only an operator's zone closes -> steps from there out of it: a vehicle
                  there leaves
     """
 
@@ -69,7 +69,7 @@ class Steering:
     reserve: int
     obstacles: Obstacles
     climb: Climb | None = None
-    ways_out: Mapping[int, int] = field(default_factory=dict)
+    exit_steps: Mapping[int, int] = field(default_factory=dict)
     waiting_ns: dict[str, tuple[int, int]] = field(default_factory=dict)
     shut_in: set[str] = field(default_factory=set)
 
@@ -83,7 +83,7 @@ class Steering:
 
     def must_leave(self, cell: int) -> bool:
         """Returns True if a cell is in a zone that a vehicle leaves."""
-        return bool(self.ways_out) and self.grid.terrain_cell(cell) in self.ways_out
+        return bool(self.exit_steps) and self.grid.terrain_cell(cell) in self.exit_steps
 
     def _allows(self, tail: int, head: int) -> bool:
         """Returns True if a step is not too steep. Steepness counts where it leads into another terrain cell."""
@@ -140,7 +140,7 @@ class Steering:
         lot: int,
     ) -> CellRequest:
         """Returns the request for a vehicle that holds these cells. Depends on nothing but its arguments, on ground
-        and obstacles near the vehicle, and on `ways_out`.
+        and obstacles near the vehicle, and on `exit_steps`.
 
         pushed_ms  the age with which it is to make way into another shard; 0 if it is not
         age_ms     for how long it has been on its way
@@ -230,13 +230,13 @@ class Steering:
         """The neighbours straight beside a cell in a zone in whose directions the next cell of the terrain is
         nearer to its border, or open."""
         grid, out = self.grid, []
-        (row, col), depth = grid.row_col(cell), self.ways_out[grid.terrain_cell(cell)]
+        (row, col), depth = grid.row_col(cell), self.exit_steps[grid.terrain_cell(cell)]
         for direction, step in grid.neighbours(cell):
             south, east = grid.parts * STEP_ROW[direction], grid.parts * STEP_COL[direction]
             if direction % 2 or step in self._shut or not grid.inside(row + south, col + east):
                 continue
             beside = grid.terrain_cell(cell + south * grid.cols + east)
-            if math.isfinite(self._pace.item(beside)) or self.ways_out.get(beside, depth) < depth:
+            if math.isfinite(self._pace.item(beside)) or self.exit_steps.get(beside, depth) < depth:
                 out.append(step)
         return out
 
@@ -366,7 +366,7 @@ class CellRequests:
 
     def make(self, vehicles: Sequence[Vehicle], now_ns: int) -> None:
         """Makes the requests of these vehicles for which anything has changed. Called once in a tick, after all
-        changes of held cells, and after `look_around`. The requests of others are as they were."""
+        changes of held cells, and after `drop_near_changes`. The requests of others are as they were."""
         holdings, steering = self.holdings, self.steering
         held = holdings.occupied()
         changed = held ^ self._held
@@ -404,7 +404,7 @@ class CellRequests:
             if request != self.of.get(id):
                 self.of[id] = request
 
-    def look_around(self, vehicles: Sequence[Vehicle]) -> None:
+    def drop_near_changes(self, vehicles: Sequence[Vehicle]) -> None:
         """Keeps no request of a vehicle near which the ground has changed, or what obstacles close and threaten."""
         changed = [*self._changed, *self.steering.obstacles.take_changed()]
         self._changed = []

@@ -120,7 +120,7 @@ class Place:
 
     def zone(self) -> None:
         cells = [vehicle.cell for vehicle in self.vehicles[: self.chance.randrange(3)]]
-        self.steering.ways_out = dict.fromkeys(cells, 2)
+        self.steering.exit_steps = dict.fromkeys(cells, 2)
         self.requests.make_anew()
 
     def wait(self) -> None:
@@ -140,7 +140,7 @@ def test_whatever_changes_the_wishes_that_are_kept_are_those_that_would_be_made_
     for _ in range(300):
         before = dict(requests._made_of)
         place.chance.choice(place.changes)()
-        requests.look_around(place.vehicles)
+        requests.drop_near_changes(place.vehicles)
         requests.make(place.vehicles, place.now_ns)
         kept += sum(before.get(id) is made_of for id, made_of in requests._made_of.items())
         told = dict(requests.of)
