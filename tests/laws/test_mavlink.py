@@ -12,7 +12,7 @@ from support.effort import few
 from launch_scripts.gateways.mavlink import mavlink_codec as codec
 from launch_scripts.gateways.mavlink.adapter import Action, Follow, Report, Unfollow
 from launch_scripts.gateways.mavlink.arming import ARDUPILOT, PX4, Arming, kind_of
-from launch_scripts.gateways.mavlink.guidance import MOST_TRIES, RETRY_NS, Way, Wishes
+from launch_scripts.gateways.mavlink.guidance import MOST_TRIES, RETRY_NS, Options, Way
 from swarm.clock import NS_PER_S
 
 OF_THE_WHEEL = (codec.ARM_DISARM, codec.DO_SET_MODE, codec.MISSION_START, codec.NAV_TAKEOFF)
@@ -96,8 +96,8 @@ def test_whatever_comes_the_vehicle_is_told_what_it_may_be_told_and_hears_us_eac
     answers: bool,
     way: Way,
 ) -> None:
-    wishes = Wishes(target, drive, arm, altitude_m, lost_s=LOST_S)  # type: ignore[arg-type]
-    world = mav.World(wishes, mav.Autopilot(*kind, answers=answers))
+    options = Options(target, drive, arm, altitude_m, lost_s=LOST_S)  # type: ignore[arg-type]
+    world = mav.World(options, mav.Autopilot(*kind, answers=answers))
     laws = Laws(world)
     laws.run(20)
     world.adapter.hear_way(way)
@@ -146,12 +146,12 @@ class Laws:
             if isinstance(action, codec.Heartbeat):
                 self.heartbeat_ns = now_ns
             if isinstance(action, codec.Command) and action.command in OF_THE_WHEEL:
-                assert self.world.wishes.arm, "nobody has asked us to arm it, or to change its mode"
+                assert self.world.options.arm, "nobody has asked us to arm it, or to change its mode"
             if isinstance(action, (*TO_THE_VEHICLE, Follow)):
                 lost = now_ns - min(self.heard_ns.values()) > LOST_S * NS_PER_S
                 asks = isinstance(action, codec.Command) and action.command == codec.SET_MESSAGE_INTERVAL
                 assert not lost or asks, "it is left to its own fail-safe"
-                assert self.world.wishes.target is not None or asks, "it is not ours to drive"
+                assert self.world.options.target is not None or asks, "it is not ours to drive"
             if isinstance(action, codec.Setpoint | codec.MissionCount | codec.MissionItem):
                 if isinstance(action, codec.Setpoint) and self.world.vehicle.autopilot == ARDUPILOT:
                     continue  # which holds at one

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from launch_scripts.gateways.mavlink import mavlink_codec as codec
 from launch_scripts.gateways.mavlink.adapter import Action, Adapter
 from launch_scripts.gateways.mavlink.arming import ARDUPILOT, PX4
-from launch_scripts.gateways.mavlink.guidance import Way, Wishes
+from launch_scripts.gateways.mavlink.guidance import Options, Way
 from swarm.client import Frame
 from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec
@@ -83,10 +83,10 @@ class World:
     said  what the core has said, with when it did
     """
 
-    def __init__(self, wishes: Wishes, vehicle: Autopilot | None = None) -> None:
+    def __init__(self, options: Options, vehicle: Autopilot | None = None) -> None:
         self.vehicle = vehicle or Autopilot()
-        self.adapter = Adapter(FRAME, wishes)
-        self.wishes = wishes
+        self.adapter = Adapter(FRAME, options)
+        self.options = options
         self.now_ns = 100 * NS_PER_S
         self.speaks = True
         self.said: list[tuple[int, Action]] = []

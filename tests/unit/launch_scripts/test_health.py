@@ -22,7 +22,7 @@ from support.processes import eventually
 
 from launch_scripts.launcher import local_processes
 from launch_scripts.launcher.local_processes import (
-    LOOK_EVERY_S,
+    CHECK_EVERY_S,
     STILL_S,
     Ending,
     LocalSwarm,
@@ -307,7 +307,7 @@ class Machine:
         self.had_s, self.slept_s = (
             (0.0, 0.0) if ticks else (self.had_s + used_s, self.slept_s + (not runnable) * (passed_s - used_s))
         )
-        return self.stillness.needs_look(self.stamp_ns) and self.stillness.hangs(
+        return self.stillness.needs_check(self.stamp_ns) and self.stillness.hangs(
             Sight(self.used_s, runnable), passed_s, idle
         )
 
@@ -367,7 +367,7 @@ def test_who_hangs_says_where_and_is_killed_if_it_cannot_but_not_while_it_starts
     Board(running.health).write(Vitals(1, 0, phase, ()))
     for _ in range(70):
         swarm._end_hung()
-        now_s += LOOK_EVERY_S
+        now_s += CHECK_EVERY_S
     ended = [(61.0, signal.SIGABRT), *((s, signal.SIGKILL) for s in (67.0, 68.0, 69.0))]
     assert sent == (ended if phase is Phase.RUNS else [])
 

@@ -23,17 +23,17 @@ from support.mavlink_world import (
 from launch_scripts.gateways.mavlink import mavlink_codec as codec
 from launch_scripts.gateways.mavlink.adapter import Follow, Report, Unfollow, Withdraw
 from launch_scripts.gateways.mavlink.arming import ARDUPILOT, PX4
-from launch_scripts.gateways.mavlink.guidance import MOST_POINTS, Upload, Way, Wishes, rest, turns
+from launch_scripts.gateways.mavlink.guidance import MOST_POINTS, Options, Upload, Way, rest, turns
 
-MISSION, GUIDED = Wishes("t0"), Wishes("t0", "guided")
+MISSION, GUIDED = Options("t0"), Options("t0", "guided")
 OFFBOARD, AUTO_MISSION, AUTO_HOLD = 6 << 16, 4 << 16 | 4 << 24, 4 << 16 | 3 << 24
 
 
 def driving(
-    wishes: Wishes, vehicle: Autopilot | None = None, way: Way = WITH_A_TURN, seconds: float = 6.0
+    options: Options, vehicle: Autopilot | None = None, way: Way = WITH_A_TURN, seconds: float = 6.0
 ) -> World:
     """A vehicle that was found and has a route."""
-    world = World(wishes, vehicle)
+    world = World(options, vehicle)
     world.run(1.0)
     world.adapter.hear_way(way)
     world.run(seconds)
@@ -53,7 +53,7 @@ def of(world: World, kind: type) -> list[object]:
 
 
 def test_a_vehicle_is_reported_ten_times_a_second_where_it_says_that_it_is() -> None:
-    world = World(Wishes())
+    world = World(Options())
     reports = [each for each in world.run(3.0) if isinstance(each, Report)]
     assert 28 <= len(reports) <= 30
     assert FRAME.cell(reports[0].x_m, reports[0].y_m) == START
@@ -133,27 +133,27 @@ def test_a_mission_has_the_turns_of_the_route_and_home_before_them_for_ardupilot
 
 
 def test_what_flies_takes_off_first_and_stays_at_the_end() -> None:
-    wishes = Wishes("t0", altitude_m=60.0, above="terrain")
-    (mission,) = driving(wishes, Autopilot(type=PLANE)).vehicle.missions
+    options = Options("t0", altitude_m=60.0, above="terrain")
+    (mission,) = driving(options, Autopilot(type=PLANE)).vehicle.missions
     assert [item.command for item in mission] == [
         codec.NAV_WAYPOINT, codec.NAV_TAKEOFF, codec.NAV_WAYPOINT, codec.NAV_WAYPOINT, codec.NAV_LOITER_UNLIM,
     ]  # fmt: skip
     assert {(item.frame, item.height_m) for item in mission} == {(codec.ABOVE_TERRAIN, 60.0)}
-    (mission,) = driving(wishes, Autopilot(type=COPTER, height_m=50.0)).vehicle.missions
+    (mission,) = driving(options, Autopilot(type=COPTER, height_m=50.0)).vehicle.missions
     assert codec.NAV_TAKEOFF not in [item.command for item in mission]
 
 
 @pytest.mark.parametrize(
-    ("wishes", "vehicle", "why"),
+    ("options", "vehicle", "why"),
     [
         (MISSION, Autopilot(PX4, COPTER), "it flies without an altitude: give --altitude M"),
-        (Wishes("t0", altitude_m=9.0, above="terrain"), Autopilot(PX4, COPTER), "takes no heights above terrain"),
-        (Wishes("t0", "guided", altitude_m=9.0), Autopilot(ARDUPILOT, PLANE), "ArduPilot has no guided mode here"),
+        (Options("t0", altitude_m=9.0, above="terrain"), Autopilot(PX4, COPTER), "takes no heights above terrain"),
+        (Options("t0", "guided", altitude_m=9.0), Autopilot(ARDUPILOT, PLANE), "ArduPilot has no guided mode here"),
         (GUIDED, Autopilot(0, 0), "has no guided mode here; give --drive mission"),
     ],
 )  # fmt: skip
-def test_what_cannot_be_driven_is_said_and_only_reported(wishes: Wishes, vehicle: Autopilot, why: str) -> None:
-    world = driving(wishes, vehicle)
+def test_what_cannot_be_driven_is_said_and_only_reported(options: Options, vehicle: Autopilot, why: str) -> None:
+    world = driving(options, vehicle)
     assert any(why in each for each in world.told())
     assert of(world, Report)
     assert not of(world, codec.MissionCount)
@@ -238,7 +238,7 @@ def test_a_vehicle_that_asks_without_end_is_given_up() -> None:
     ],
 )
 def test_with_arm_it_is_armed_and_driven_as_its_make_asks(vehicle: Autopilot, steps: list[tuple[int, int]]) -> None:
-    driving(Wishes("t0", arm=True), vehicle, seconds=20.0)
+    driving(Options("t0", arm=True), vehicle, seconds=20.0)
     made = [
         (each.command, mode_of(each)) for each in vehicle.commands if each.command != codec.SET_MESSAGE_INTERVAL
     ]
@@ -254,7 +254,7 @@ def mode_of(command: codec.Command) -> int:
 def test_a_vehicle_that_refuses_to_be_armed_is_asked_ten_times() -> None:
     vehicle = Autopilot(PX4, answers=True)
     vehicle._obey = lambda command, params: 2  # type: ignore[method-assign]
-    world = driving(Wishes("t0", arm=True), vehicle, seconds=60.0)
+    world = driving(Options("t0", arm=True), vehicle, seconds=60.0)
     assert sum(each.command == codec.DO_SET_MODE for each in vehicle.commands) == 10
     assert any("refuses to change its mode: MAV_RESULT 2" in each for each in world.told())
     assert world.told()[-1].endswith("it has not obeyed 10 commands")
@@ -264,14 +264,14 @@ def test_a_vehicle_that_knows_no_start_of_missions_is_told_three_times_and_left_
     vehicle = Autopilot(0, 0)
     obey = vehicle._obey
     vehicle._obey = lambda command, params: 3 if command == codec.MISSION_START else obey(command, params)  # type: ignore[method-assign]
-    world = driving(Wishes("t0", arm=True), vehicle, seconds=60.0)
+    world = driving(Options("t0", arm=True), vehicle, seconds=60.0)
     assert [each.command for each in vehicle.commands].count(codec.MISSION_START) == 3
     assert not any("left alone" in each for each in world.told())
 
 
 def test_when_the_swarm_is_lost_the_vehicle_holds_and_goes_on_when_it_is_back() -> None:
     vehicle = Autopilot(PX4)
-    world = driving(Wishes("t0", arm=True), vehicle, seconds=10.0)
+    world = driving(Options("t0", arm=True), vehicle, seconds=10.0)
     world.adapter.hear_swarm(False)
     world.run(3.0)
     assert vehicle.mode == AUTO_HOLD
@@ -286,7 +286,7 @@ def test_when_the_swarm_is_lost_the_vehicle_holds_and_goes_on_when_it_is_back() 
 
 def test_px4_gets_setpoints_before_it_is_brought_into_offboard_and_none_when_the_swarm_is_lost() -> None:
     vehicle = Autopilot(PX4)
-    world = driving(Wishes("t0", "guided", arm=True), vehicle, seconds=8.0)
+    world = driving(Options("t0", "guided", arm=True), vehicle, seconds=8.0)
     first = next(ns for ns, action in world.said if isinstance(action, codec.Setpoint))
     mode = next(
         ns for ns, each in world.said if isinstance(each, codec.Command) and each.command == codec.DO_SET_MODE
@@ -322,7 +322,7 @@ def test_what_was_steered_before_the_link_was_lost_is_not_held_when_it_is_back()
 
 def test_a_copter_in_guided_takes_off_once() -> None:
     vehicle = Autopilot(type=COPTER)
-    world = driving(Wishes("t0", "guided", arm=True, altitude_m=30.0), vehicle, seconds=10.0)
+    world = driving(Options("t0", "guided", arm=True, altitude_m=30.0), vehicle, seconds=10.0)
     takeoffs = [each for each in vehicle.commands if each.command == codec.NAV_TAKEOFF]
     assert [each.params[-1] for each in takeoffs] == [30.0]
     assert {each.height_m for each in of(world, codec.Setpoint)} == {30.0}  # type: ignore[attr-defined]

@@ -21,7 +21,7 @@ from support.mavlink_world import FRAME, GRID, START
 from support.swarm_model import SwarmModel
 
 from launch_scripts.gateways.mavlink import mavlink_codec as codec
-from launch_scripts.gateways.mavlink.guidance import Wishes
+from launch_scripts.gateways.mavlink.guidance import Options
 from launch_scripts.gateways.mavlink.link import StreamLink, UdpLink, open_link, read_address
 from launch_scripts.gateways.mavlink.mavlink_codec import Wire
 from launch_scripts.gateways.mavlink.service import Shell, check_ground, read_key
@@ -353,7 +353,7 @@ class PlayedLink:
 
 
 class Rig:
-    def __init__(self, wishes: Wishes) -> None:
+    def __init__(self, options: Options) -> None:
         self.world = SwarmModel()
         self.obstacles: list[Obstacle] = []
         self.world.bus("ear").subscribe(OBSTACLE, self._hear)
@@ -366,7 +366,7 @@ class Rig:
             Swarm(self.session),
             self.link,
             Wire(None, None, time.time()),
-            wishes,
+            options,
             self.told.append,
             lambda: self.now_ns,
         )
@@ -390,7 +390,7 @@ class Rig:
 
 
 def test_a_flood_of_strangers_delays_no_heartbeat_and_hides_no_vehicle() -> None:
-    rig = Rig(Wishes())
+    rig = Rig(Options())
     rig.vehicle_says(3, 10)
     rig.link.flood = Sender(9).bytes_of(common.MAVLink_attitude_message(0, 0, 0, 0, 0, 0, 0))
     rig.turns(2.2)
@@ -401,7 +401,7 @@ def test_a_flood_of_strangers_delays_no_heartbeat_and_hides_no_vehicle() -> None
 
 
 def test_when_the_run_is_another_one_the_vehicle_is_put_on_hold_before_the_error_ends_it() -> None:
-    rig = Rig(Wishes("t0", arm=True, lost_s=60.0))
+    rig = Rig(Options("t0", arm=True, lost_s=60.0))
     mission = 4 << 16 | 4 << 24
     rig.vehicle_says(12, 10, mission, base=1 | 128)
     rig.turns(0.1)

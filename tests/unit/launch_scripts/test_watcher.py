@@ -134,7 +134,7 @@ class Part:
         grid = self.swarm.terrain.grid
         self.known: Any = Recorder(SCENARIO, grid, 0) if records else OwnPart(grid, 0)
         self.watcher = Watcher(self.swarm.bus("launcher"), self.known, self.swarm.scheduler.clock)
-        self.watcher.look_after(own)
+        self.watcher.set_own(own)
         self.buses = {spec: self.swarm.bus(spec.name) for spec in PROCESSES}
         self.said = 0
 
@@ -169,7 +169,7 @@ def test_whatever_processes_it_has_it_hears_those_and_no_others_also_after_they_
     part.speak()
     part.watcher.take_notes()
     for own in (first, then):
-        part.watcher.look_after(own)
+        part.watcher.set_own(own)
         part.swarm.run(0.1)
         part.speak()
         notes = part.watcher.take_notes()
@@ -212,7 +212,7 @@ def test_what_operators_order_is_heard_so_that_planners_of_added_targets_start_a
 def test_a_process_of_its_own_that_is_gone_is_an_alarm_and_one_of_another_machine_is_not() -> None:
     mine, other = ProcessSpec("planner", "t0", added=True), ProcessSpec("planner", "t1", added=True)
     known = OwnPart(SwarmModel().terrain.grid, 0)
-    known.look_after(frozenset({mine, *processes_of(SCENARIO, ("router", "monitor"))}))
+    known.set_own(frozenset({mine, *processes_of(SCENARIO, ("router", "monitor"))}))
     now_ns = 100 * NS_PER_S
     known.started(Peer(mine.role, mine.id, 7))
     known.alive(Peer(mine.role, mine.id, 6), True, now_ns)  # another run's
