@@ -126,10 +126,10 @@ def layers_of(route: DescribedRoute, ending: str) -> list[gis_formats.Layer]:
     if route.height_m is not None:
         columns["height_m"] = route.height_m.round(2)
     columns |= steps
-    rows = zip(*(column.tolist() for column in columns.values()), strict=True)
+    records = zip(*(column.tolist() for column in columns.values()), strict=True)
     points = [
         gis_formats.Feature([place], dict(zip(columns, each, strict=True)))
-        for place, each in zip(xy_m[:, None, :2], rows, strict=True)
+        for place, each in zip(xy_m[:, None, :2], records, strict=True)
     ]
     types: dict[str, gis_formats.FieldKind] = {
         name: "int" if name in ("row", "col") else "real" for name in columns
@@ -384,8 +384,8 @@ def write_reach(found: Reach, path: Path, every_s: float | None, slack: float) -
     if path.suffix.lower() in (".tif", ".tiff"):
         seconds = np.where(np.isfinite(found.seconds), found.seconds, np.float32(-1))
         description = f"{gis_formats.COSTS} {found.rule}"
-        bands, tags = ["seconds of travel, -1 no way"], {"TIFFTAG_IMAGEDESCRIPTION": description}
-        gis_formats.write_raster(path, [seconds], found.grid, descriptions=bands, unit="s", tags=tags, nodata=-1.0)
+        texts, tags = ["seconds of travel, -1 no way"], {"TIFFTAG_IMAGEDESCRIPTION": description}
+        gis_formats.write_raster(path, [seconds], found.grid, descriptions=texts, unit="s", tags=tags, nodata=-1.0)
         return
     if every_s is None:
         every_s = _BAND_S if found.fastest_s is None else max(found.fastest_s * slack / _SLACK_BANDS, 1e-3)

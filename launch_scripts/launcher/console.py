@@ -42,7 +42,7 @@ _PLAIN_EVERY_S = 5.0
 _BUSY_EVERY_S = 0.2
 """Interval of what changes in its place. Chosen, not measured."""
 _TABLE_EVERY_S = 1.0
-"""The table's content is made once a second (`Recorder.shown`)."""
+"""The table's content is made once a second (`Recorder.summary`)."""
 _READER_GONE = frozenset((errno.EPIPE, errno.EIO, errno.EBADF, errno.ENXIO))
 """Errors of a pipe, and of a terminal, without a reader."""
 

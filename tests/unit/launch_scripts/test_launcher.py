@@ -259,11 +259,11 @@ def test_an_added_process_that_refuses_ends_no_run(tmp_path: Path, swarms: list[
 
 
 def test_what_loads_kernels_for_a_launcher_that_is_gone_ends_without_a_word() -> None:
-    listens, tell = multiprocessing.Pipe(duplex=False)
-    listens.close()
-    _build(tell, None, is_first=True)
+    receiver, sender = multiprocessing.Pipe(duplex=False)
+    receiver.close()
+    _build(sender, None, is_first=True)
     with pytest.raises(OSError, match="Broken pipe"):
-        tell.send(0)
+        sender.send(0)
 
 
 def test_builders_make_what_the_places_process_starts_with_before_what_saves_time(monkeypatch) -> None:
