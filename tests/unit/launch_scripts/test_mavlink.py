@@ -46,7 +46,7 @@ def places(items: list[codec.MissionItem]) -> list[int]:
 
 
 def of(world: World, kind: type) -> list[object]:
-    return [action for _, action in world.said if isinstance(action, kind)]
+    return [action for _, action in world.sent if isinstance(action, kind)]
 
 
 # --- in the swarm ------------------------------------------------------------------------------------------------
@@ -64,11 +64,11 @@ def test_a_vehicle_is_reported_ten_times_a_second_where_it_says_that_it_is() -> 
 def test_one_that_drives_stays_an_obstacle_when_its_link_is_lost_and_gets_its_target_back() -> None:
     world = driving(MISSION)
     world.speaks = False
-    said = world.run(8.0)
-    assert [type(each) for each in said if isinstance(each, Unfollow | Withdraw | Report)] == [Unfollow, Report]
-    (last,) = [each for each in said if isinstance(each, Report)]
+    sent = world.run(8.0)
+    assert [type(each) for each in sent if isinstance(each, Unfollow | Withdraw | Report)] == [Unfollow, Report]
+    (last,) = [each for each in sent if isinstance(each, Report)]
     assert last.heading_rad is None, "where to it went nobody knows"
-    assert "no heartbeat for 5 s: the vehicle is left to its own fail-safe" in world.told()
+    assert "no heartbeat for 5 s: the vehicle is left to its own fail-safe" in world.sentences()
     world.speaks = True
     assert [each for each in world.run(1.0) if isinstance(each, Follow)] == [Follow("t0")]
 
@@ -80,7 +80,7 @@ def test_a_vehicle_that_is_back_is_where_it_says_and_not_where_the_one_before_wa
         world.hear(world.vehicle.position())  # of one whose heartbeats are lost
         world.run(0.5)
     world.run(2.5)
-    assert "no heartbeat for 5 s: the vehicle is left to its own fail-safe" in world.told()
+    assert "no heartbeat for 5 s: the vehicle is left to its own fail-safe" in world.sentences()
     world.hear(world.vehicle.beat())
     assert not [each for each in world.run(0.5) if isinstance(each, Follow | Report)]
     world.hear(world.vehicle.position())
@@ -92,9 +92,9 @@ def test_outside_the_terrain_it_is_nowhere_for_the_swarm() -> None:
     world.speaks = False
     world.hear(world.vehicle.beat())
     world.hear(codec.Position(0.5, 0.5, 0.0, 0.0, None))
-    said = world.run(0.2)
-    assert [type(each) for each in said if isinstance(each, Unfollow | Withdraw | Report)] == [Unfollow, Withdraw]
-    assert "it is outside the terrain: the vehicle is left to its own fail-safe" in world.told()
+    sent = world.run(0.2)
+    assert [type(each) for each in sent if isinstance(each, Unfollow | Withdraw | Report)] == [Unfollow, Withdraw]
+    assert "it is outside the terrain: the vehicle is left to its own fail-safe" in world.sentences()
 
 
 def test_another_kind_under_the_same_number_is_not_heard() -> None:
@@ -103,7 +103,7 @@ def test_another_kind_under_the_same_number_is_not_heard() -> None:
     world.hear(codec.Beat(PX4, COPTER, True, OFFBOARD))
     world.run(1.0)
     assert world.adapter.kind.name == "ArduPilot"
-    assert "another kind of vehicle speaks under the same number: it is ignored" in world.told()
+    assert "another kind of vehicle speaks under the same number: it is ignored" in world.sentences()
 
 
 def test_a_vehicle_that_warns_without_end_fills_no_log() -> None:
@@ -112,7 +112,7 @@ def test_a_vehicle_that_warns_without_end_fills_no_log() -> None:
         world.hear(codec.Warned(f"number {number}"))
         if number % 4 == 0:
             world.tick()
-    assert sum("the vehicle says" in each for each in world.told()) < 20
+    assert sum("the vehicle says" in each for each in world.sentences()) < 20
 
 
 # --- missions ----------------------------------------------------------------------------------------------------
@@ -154,7 +154,7 @@ def test_what_flies_takes_off_first_and_stays_at_the_end() -> None:
 )  # fmt: skip
 def test_what_cannot_be_driven_is_said_and_only_reported(options: Options, vehicle: Autopilot, why: str) -> None:
     world = driving(options, vehicle)
-    assert any(why in each for each in world.told())
+    assert any(why in each for each in world.sentences())
     assert of(world, Report)
     assert not of(world, codec.MissionCount)
     assert not of(world, codec.Setpoint)
@@ -184,10 +184,10 @@ def test_a_long_route_is_uploaded_in_parts() -> None:
 def test_a_silent_vehicle_is_asked_five_times_and_then_told_of_again() -> None:
     vehicle = Autopilot(answers=False)
     world = driving(MISSION, vehicle, seconds=20.0)
-    times_s = [ns / 1e9 for ns, action in world.said if isinstance(action, codec.MissionCount)]
+    times_s = [ns / 1e9 for ns, action in world.sent if isinstance(action, codec.MissionCount)]
     assert [round(b - a, 1) for a, b in pairwise(times_s[:5])] == [1.5] * 4
     assert times_s[5] - times_s[4] >= 5.0
-    assert "a mission of 4 items has failed: the vehicle did not answer 5 times" in world.told()
+    assert "a mission of 4 items has failed: the vehicle did not answer 5 times" in world.sentences()
     vehicle.answers = True
     world.run(8.0)
     assert len(vehicle.missions) == 1
@@ -197,7 +197,7 @@ def test_a_refused_mission_says_the_result() -> None:
     world = driving(MISSION, Autopilot(answers=False), seconds=0.2)
     world.hear(codec.MissionAnswered(13))
     world.run(0.2)
-    assert "a mission of 4 items has failed: the vehicle refused it with MAV_MISSION_RESULT 13" in world.told()
+    assert "a mission of 4 items has failed: the vehicle refused it with MAV_MISSION_RESULT 13" in world.sentences()
 
 
 def test_items_are_asked_for_in_any_order_again_and_beyond_the_end() -> None:
@@ -256,8 +256,8 @@ def test_a_vehicle_that_refuses_to_be_armed_is_asked_ten_times() -> None:
     vehicle._obey = lambda command, params: 2  # type: ignore[method-assign]
     world = driving(Options("t0", arm=True), vehicle, seconds=60.0)
     assert sum(each.command == codec.DO_SET_MODE for each in vehicle.commands) == 10
-    assert any("refuses to change its mode: MAV_RESULT 2" in each for each in world.told())
-    assert world.told()[-1].endswith("it has not obeyed 10 commands")
+    assert any("refuses to change its mode: MAV_RESULT 2" in each for each in world.sentences())
+    assert world.sentences()[-1].endswith("it has not obeyed 10 commands")
 
 
 def test_a_vehicle_that_knows_no_start_of_missions_is_told_three_times_and_left_in_peace() -> None:
@@ -266,7 +266,7 @@ def test_a_vehicle_that_knows_no_start_of_missions_is_told_three_times_and_left_
     vehicle._obey = lambda command, params: 3 if command == codec.MISSION_START else obey(command, params)  # type: ignore[method-assign]
     world = driving(Options("t0", arm=True), vehicle, seconds=60.0)
     assert [each.command for each in vehicle.commands].count(codec.MISSION_START) == 3
-    assert not any("left alone" in each for each in world.told())
+    assert not any("left alone" in each for each in world.sentences())
 
 
 def test_when_the_swarm_is_lost_the_vehicle_holds_and_goes_on_when_it_is_back() -> None:
@@ -287,9 +287,9 @@ def test_when_the_swarm_is_lost_the_vehicle_holds_and_goes_on_when_it_is_back() 
 def test_px4_gets_setpoints_before_it_is_brought_into_offboard_and_none_when_the_swarm_is_lost() -> None:
     vehicle = Autopilot(PX4)
     world = driving(Options("t0", "guided", arm=True), vehicle, seconds=8.0)
-    first = next(ns for ns, action in world.said if isinstance(action, codec.Setpoint))
+    first = next(ns for ns, action in world.sent if isinstance(action, codec.Setpoint))
     mode = next(
-        ns for ns, each in world.said if isinstance(each, codec.Command) and each.command == codec.DO_SET_MODE
+        ns for ns, each in world.sent if isinstance(each, codec.Command) and each.command == codec.DO_SET_MODE
     )
     assert 1.0 <= (mode - first) / 1e9 <= 1.2
     assert (vehicle.mode, vehicle.armed) == (OFFBOARD, True)
