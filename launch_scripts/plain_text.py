@@ -18,7 +18,7 @@ _NAMED = 3
 """Names in a line for many: three ids fit 80 columns beside label, count and time."""
 
 
-def said_duration(seconds: float) -> str:
+def format_duration(seconds: float) -> str:
     """Returns a length of time, such as 86 s, 19 min, 5 h 20 min."""
     left = round(seconds)
     if left < _SECONDS_UP_TO:
@@ -28,7 +28,7 @@ def said_duration(seconds: float) -> str:
     return f"{many} {unit}" + (f" {rest // parts} {part}" if part and rest >= parts else "")
 
 
-def said_moment(ns: int) -> str:
+def format_time(ns: int) -> str:
     """Returns an instant, in ns since 1970, by this machine's local time: 14:22:10."""
     return time.strftime("%H:%M:%S", time.localtime(ns // NS_PER_S))
 

@@ -106,17 +106,17 @@ def with_short_types(command: Any, ctx: Any) -> Any:
     from typer import rich_utils
 
     rich_utils.RANGE_STRING = ""
-    shown = copy(command)
-    shown.params = [copy(each) for each in command.params]
-    for each in shown.get_params(ctx):
-        if said := ", ".join(bounds_of(msgspec.Meta(ge=each.min, le=each.max))):
-            each.help = f"{each.help} \\[{said}]"
+    copied = copy(command)
+    copied.params = [copy(each) for each in command.params]
+    for each in copied.get_params(ctx):
+        if bounds := ", ".join(bounds_of(msgspec.Meta(ge=each.min, le=each.max))):
+            each.help = f"{each.help} \\[{bounds}]"
         if each.param_type_name == "option":
             usual = _NUMBERS.get(each.type_descriptor.annotation) or re.sub(
                 r"list\[|\]", "", each.display_type(ctx)
             )
             each.metavar = "" if each.is_flag else each.metavar or usual
-    return shown
+    return copied
 
 
 def family_app(help: str) -> typer.Typer:
@@ -136,20 +136,20 @@ def _prose(docstring: str | None) -> str:
 
 def _called_with_options(function: Callable[..., int | None]) -> Callable[..., None]:
     """The function as Typer reads it: every dataclass parameter is replaced by the fields of its class."""
-    said = {name: text.format(**_LISTS) for name, text in meanings(function).items()}
+    texts = {name: text.format(**_LISTS) for name, text in meanings(function).items()}
     groups: dict[str, Any] = {}
     parameters: list[inspect.Parameter] = []
     for each in inspect.signature(function, eval_str=True).parameters.values():
         if not is_dataclass(each.annotation):
-            parameters.append(_parameter(each.name, each.annotation, each.default, said.get(each.name)))
+            parameters.append(_parameter(each.name, each.annotation, each.default, texts.get(each.name)))
             continue
         group: Any = each.annotation
         groups[each.name] = group
         bases: list[Any] = [base for base in reversed(group.__mro__) if is_dataclass(base)]
-        told = {name: (text, base.panel) for base in bases for name, text in meanings(base).items()}
+        rows = {name: (text, base.panel) for base in bases for name, text in meanings(base).items()}
         hints = get_type_hints(group, include_extras=True)
         for field in fields(group):
-            text, panel = told.get(field.name, (None, group.panel))
+            text, panel = rows.get(field.name, (None, group.panel))
             parameters.append(_parameter(field.name, hints[field.name], field.default, text, panel))
 
     def run(**values: Any) -> None:
@@ -164,12 +164,12 @@ def _called_with_options(function: Callable[..., int | None]) -> Callable[..., N
     return run
 
 
-def _parameter(name: str, hint: Any, default: Any, said: str | None, panel: str | None = None) -> inspect.Parameter:
+def _parameter(name: str, hint: Any, default: Any, text: str | None, panel: str | None = None) -> inspect.Parameter:
     """A parameter with its meaning; one that is true or false is given as `--name` alone."""
     kind, *declared = (hint.__origin__, *hint.__metadata__) if hasattr(hint, "__metadata__") else (hint,)
     is_argument = default is inspect.Parameter.empty
     info = copy(declared[0]) if declared else typer.Argument() if is_argument else typer.Option()
-    info.help = said or info.help
+    info.help = text or info.help
     info.rich_help_panel = panel
     if kind is bool and not isinstance(info.default, str):  # where Typer keeps a name that is declared
         info.param_decls = (f"--{name.replace('_', '-')}",)
@@ -274,8 +274,8 @@ def run_command(command: Callable[[], Any], name: str = "swarm") -> int:
         finally:
             sys.stdout.flush()
     except TyperException as error:
-        said = _sentence(error)
-        return _refused(said, ConfigError.exit_code) if said else ConfigError.exit_code
+        sentence = _sentence(error)
+        return _refused(sentence, ConfigError.exit_code) if sentence else ConfigError.exit_code
     except typer.Abort:
         return _refused("stopped; nothing is written", 1)
     except SwarmError as error:
@@ -319,26 +319,26 @@ def _sentence(error: TyperException) -> str:
     ctx: Any = getattr(error, "ctx", None)
     param: Any = getattr(error, "param", None)
     wrong: list[Any] = getattr(error.__cause__, "errors", list)()
-    said: str = error.format_message()
+    text: str = error.format_message()
     if wrong:
-        said = said.replace(wrong[0]["msg"], f"found {quoted(wrong[0]['input'])}; {wrong[0]['msg']}")
-        said = re.sub("Value error, |, unable to parse [^;]*", "", said).replace("Input should be", "expected")
-        said = said.replace("greater than or equal to", "at least").replace("less than or equal to", "at most")
-    elif param is not None and said.startswith("Missing") and param.help:
-        said = f"{said.removesuffix('.')}: {param.help}"
-    elif unknown := re.fullmatch(r"No such command '(.*)'\.", said, re.DOTALL):
-        said = said.removesuffix(".") + _meant(unknown[1], ctx)
-    elif option := getattr(error, "option_name", None) if said.startswith("No such option") else None:
+        text = text.replace(wrong[0]["msg"], f"found {quoted(wrong[0]['input'])}; {wrong[0]['msg']}")
+        text = re.sub("Value error, |, unable to parse [^;]*", "", text).replace("Input should be", "expected")
+        text = text.replace("greater than or equal to", "at least").replace("less than or equal to", "at most")
+    elif param is not None and text.startswith("Missing") and param.help:
+        text = f"{text.removesuffix('.')}: {param.help}"
+    elif unknown := re.fullmatch(r"No such command '(.*)'\.", text, re.DOTALL):
+        text = text.removesuffix(".") + _meant(unknown[1], ctx)
+    elif option := getattr(error, "option_name", None) if text.startswith("No such option") else None:
         names = [name for each in ctx.command.params for name in each.opts]
         there = _elsewhere(option, ctx)
-        said = f"No such option: {option}{_asked(there) if there else nearest(option, names)}"
+        text = f"No such option: {option}{_asked(there) if there else nearest(option, names)}"
     for before, word in pairwise(sys.argv):
         if re.fullmatch(r"\S*\d,", before) and re.fullmatch(r"[-+.\d]+", word):
-            return f"{said.removesuffix('.')}; a place has no blank: did you mean '{before}{word}'?"
+            return f"{text.removesuffix('.')}; a place has no blank: did you mean '{before}{word}'?"
     if ctx is None:
-        return said
-    said = re.sub(r"(?<!\.)\.$", "", said)
-    return f"{said}{'' if said.endswith('?') else ';'} `{ctx.command_path} -h` explains"
+        return text
+    text = re.sub(r"(?<!\.)\.$", "", text)
+    return f"{text}{'' if text.endswith('?') else ';'} `{ctx.command_path} -h` explains"
 
 
 def _meant(word: str, ctx: Any) -> str:

@@ -59,8 +59,8 @@ def answer(found: Sequence[Finding], as_json: bool, facts: dict[str, Any], summa
 
     failed = any(finding.level == "failure" for finding in found)
     if as_json:
-        told = {**facts, "ok": not failed, "findings": [finding._asdict() for finding in found]}
-        print(json.dumps(told, indent=2))
+        output = {**facts, "ok": not failed, "findings": [finding._asdict() for finding in found]}
+        print(json.dumps(output, indent=2))
         return int(failed)
     console = Console(soft_wrap=True, highlight=False)
     for finding in found:

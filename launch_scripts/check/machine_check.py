@@ -168,20 +168,20 @@ def _unwritable(runs: Path) -> str | None:
 
 # --- swarm doctor: each check says how it is, and what to do if that is not well
 
-Said = tuple[Level, str]
+Result = tuple[Level, str]
 
 
 def examine(runs: Path) -> Iterator[Finding]:
     """Everything, one after the other. A thing that cannot be looked at is a warning, never an error."""
-    for about, look in CHECKS.items():
+    for about, check in CHECKS.items():
         try:
-            level, text = look(runs)
+            level, text = check(runs)
             yield Finding(level, about, text)
         except (SwarmError, OSError, ValueError, ImportError, AttributeError) as error:
             yield warning(about, f"cannot be looked at: {error}")
 
 
-def _packages(runs: Path) -> Said:
+def _packages(runs: Path) -> Result:
     from packaging.requirements import Requirement
 
     every = list(map(Requirement, importlib.metadata.requires(OURS) or ()))
@@ -208,7 +208,7 @@ def _packages(runs: Path) -> Said:
     return "ok", f"all fit; {OURS} {version_of(OURS)}, zenoh {zenoh}, Python {python}{without}"
 
 
-def _planner_kernels(runs: Path) -> Said:
+def _planner_kernels(runs: Path) -> Result:
     from planner_service.kernel_build import all_kernels
     from planner_service.kernels.decorators import cache_folder, code_folder, is_on_disk
 
@@ -227,7 +227,7 @@ def _planner_kernels(runs: Path) -> Said:
     return "ok", f"all {len(kernels)} are compiled, in {folder}"
 
 
-def _cores(runs: Path) -> Said:
+def _cores(runs: Path) -> Result:
     cores, load = len(os.sched_getaffinity(0)), os.getloadavg()[0]
     if cores < 2:
         return "warning", "1: processes take turns, so ticks will be late; two are enough for the demo"
@@ -236,21 +236,21 @@ def _cores(runs: Path) -> Said:
     return "ok", f"{cores}, load {load:.1f}"
 
 
-def _memory(runs: Path) -> Said:
+def _memory(runs: Path) -> Result:
     free = this_machine(runs).free_bytes
     if free < _ENOUGH_BYTES:
         return "warning", f"{size(free)} are free; the demo takes about 0.6 GB: end something else first"
     return "ok", f"{size(free)} are free"
 
 
-def _open_files(runs: Path) -> Said:
+def _open_files(runs: Path) -> Result:
     soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
     if soft != resource.RLIM_INFINITY and soft < _ENOUGH_FILES:
         return "warning", f"{soft} at a time, too few for a router of many: `ulimit -n {min(4096, hard)}`"
     return "ok", "any number at a time" if soft == resource.RLIM_INFINITY else f"{soft} at a time"
 
 
-def _zenoh(runs: Path) -> Said:
+def _zenoh(runs: Path) -> Result:
     from launch_scripts.ports import free_ports
     from swarm.bus.zenoh_bus import open_bus
 
@@ -266,7 +266,7 @@ def _zenoh(runs: Path) -> Said:
     return "ok", f"two sessions met on 127.0.0.1:{port} within {took_ms:.0f} ms"
 
 
-def _clock(runs: Path) -> Said:
+def _clock(runs: Path) -> Result:
     # All zero asks and changes nothing. A state below 0: the kernel gives none.
     state = int(ctypes.CDLL(None).adjtimex(ctypes.create_string_buffer(_TIMEX_BYTES)))
     if state == _UNSYNCHRONISED:
@@ -274,7 +274,7 @@ def _clock(runs: Path) -> Said:
     return "ok", "synchronised" if state >= 0 else "whether it is synchronised is not known"
 
 
-def _disk(runs: Path) -> Said:
+def _disk(runs: Path) -> Result:
     if (complaint := _unwritable(runs)) is not None:
         return "failure", complaint
     folder = _nearest(runs)
@@ -284,9 +284,9 @@ def _disk(runs: Path) -> Said:
     return "ok", f"{size(free)} are free in {folder}"
 
 
-CHECKS: dict[str, Callable[[Path], Said]] = {
-    look.__name__.strip("_").replace("_", " "): look
-    for look in (
+CHECKS: dict[str, Callable[[Path], Result]] = {
+    check.__name__.strip("_").replace("_", " "): check
+    for check in (
         _packages, _planner_kernels, _cores, _memory, _open_files, _zenoh, _clock, _disk,
     )
 }  # fmt: skip

@@ -151,8 +151,8 @@ def _certificates(scenario: Scenario, tls: TlsConfig, whole: bool) -> Iterator[F
             return
     if lacking and whole:
         several = f" and {len(lacking) - 1} more" if len(lacking) > 1 else ""
-        told = f"{tls.certificate} has no certificate of {lacking[0]}{several}; {make}"
-        yield failure("network.tls", f"{told}, and one machine of several needs its own only")
+        lack = f"{tls.certificate} has no certificate of {lacking[0]}{several}; {make}"
+        yield failure("network.tls", f"{lack}, and one machine of several needs its own only")
 
 
 def plugins(scenario: Scenario) -> Iterator[Finding]:
@@ -255,10 +255,10 @@ def _targets(scenario: Scenario, terrain: Terrain, truth: Floats, homes: Bools) 
         if target.start is None:
             continue
         key = f"targets[{n}].start"
-        place, shown, fault = _start(target.start, frame, key, closed)
+        place, text, fault = _start(target.start, frame, key, closed)
         if fault is None and not homes[place]:
             part = "the largest part of the terrain that can be driven"
-            fault = failure(key, f"no way leads to {shown} from {part}, where vehicles start{_near(~homes, place)}")
+            fault = failure(key, f"no way leads to {text} from {part}, where vehicles start{_near(~homes, place)}")
         yield from [fault] if fault else []
 
 
@@ -270,12 +270,12 @@ def _vehicles(scenario: Scenario, grid: GridSpec, grounds: Mapping[str, ClassGro
         closed, homes = np.isinf(own.truth) | own.terrain.lethal, own.homes
         whom = "" if group.vehicle_class == GROUND else f" to the class {group.vehicle_class}"
         for given in group.cells:
-            place, shown, fault = _start(given, frame, key, closed, whom)
+            place, text, fault = _start(given, frame, key, closed, whom)
             if fault is None and place in taken:
-                fault = failure(key, f"{shown} is given twice, here and in {taken[place]}")
+                fault = failure(key, f"{text} is given twice, here and in {taken[place]}")
             refused |= fault is not None
             if fault is None and not homes[place]:
-                fault = warning(key, f"{shown} is cut off from the largest part that can be driven")
+                fault = warning(key, f"{text} is cut off from the largest part that can be driven")
             yield from [fault] if fault else []
             taken[place] = key
     if refused:
@@ -294,9 +294,9 @@ def _start(
         place = frame.grid.row_col(cell_of(given, frame, key))
     except ConfigError as error:
         return (-1, -1), "", failure("", str(error))
-    shown = str(list(place)) if not isinstance(given, str) else f"{given!r}, {list(place)},"
-    lethal = failure(key, f"{shown} is lethal{whom}{_near(closed, place)}") if closed[place] else None
-    return place, shown, lethal
+    text = str(list(place)) if not isinstance(given, str) else f"{given!r}, {list(place)},"
+    lethal = failure(key, f"{text} is lethal{whom}{_near(closed, place)}") if closed[place] else None
+    return place, text, lethal
 
 
 def _near(closed: Bools, place: tuple[int, int]) -> str:
@@ -362,8 +362,8 @@ def _findings(read: Reading, runs: Path, facts: dict[str, Any]) -> Iterator[Find
     if broken or read.faults:
         return
     try:
-        with progress() as tell:
-            terrain = build_terrain(scenario, tell)
+        with progress() as show:
+            terrain = build_terrain(scenario, show)
         truth = build_truth(scenario, terrain)
     except SwarmError as error:
         yield failure("", str(error))

@@ -216,14 +216,14 @@ def metrics(
                 return families(run, latest, latest.status, latest.up()) if run and latest else Families()
 
             typer.echo(f"metrics at {endpoint.url}; Ctrl-C ends it")
-            told = None
+            printed = None
             while True:
                 observer.listen(clock, _TURN_S)
                 endpoint.answer(figures)
                 health.turned([] if observer.run is not None else ["a run"])
-                if observer.run is not None and observer.run.run_id != told:
-                    told = observer.run.run_id
-                    typer.echo(f"run {told}, scenario {observer.run.scenario}")
+                if observer.run is not None and observer.run.run_id != printed:
+                    printed = observer.run.run_id
+                    typer.echo(f"run {printed}, scenario {observer.run.scenario}")
     except KeyboardInterrupt:
         pass
     finally:

@@ -60,8 +60,8 @@ def ros2(
     """
     from launch_scripts.gateways.ros2.gateway_settings import load_settings
 
-    told = {"ros.endpoint": side.ros, "ros.domain": side.domain, "ros.distribution": side.distribution}
-    chosen = load_settings(settings, {**told, "vehicles": vehicles})
+    options = {"ros.endpoint": side.ros, "ros.domain": side.domain, "ros.distribution": side.distribution}
+    chosen = load_settings(settings, {**options, "vehicles": vehicles})
     ours = chosen.swarm
     where = replace(where, connect=where.connect or ours.connect, namespace=where.namespace or ours.namespace)
     if where.tls_ca is None and where.tls_dir is None:
@@ -149,7 +149,7 @@ def mavlink(
 
     link  udpin:HOST:PORT, udpout:HOST:PORT, tcp:HOST:PORT or serial:DEVICE:BAUD.
     """
-    from launch_scripts.gateways.mavlink.guidance import Wishes
+    from launch_scripts.gateways.mavlink.guidance import Options
     from launch_scripts.gateways.mavlink.link import read_address
     from launch_scripts.gateways.mavlink.service import read_key, run
 
@@ -173,8 +173,8 @@ def mavlink(
         raise ConfigError("--above terrain needs --altitude: the metres above it")
     network = where.network()
 
-    wishes = Wishes(
+    options = Options(
         target, drives.drive, drives.arm, altitude, drives.above, vehicle.lost_after,
         id, vehicle.group, vehicle.radius, drives.vehicle_class,
     )  # fmt: skip
-    run(lambda: _join(network), address, wishes, sysid=vehicle.sysid, key=key, tell=typer.echo)
+    run(lambda: _join(network), address, options, sysid=vehicle.sysid, key=key, say=typer.echo)

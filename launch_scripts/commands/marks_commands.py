@@ -136,12 +136,12 @@ def export(store: Store, out: Annotated[Path, typer.Option()], force: Force = Fa
         marks = [each for each in marks if each.tile < grid.tiles]
         pace, kind = to_cells(grid, sets, time.time_ns())
         if ending in TIFF:
-            said = np.where(kind == NOTHING_SAID_BAND, np.float32(np.nan), kind.astype(np.float32))
+            kinds = np.where(kind == NOTHING_SAID_BAND, np.float32(np.nan), kind.astype(np.float32))
             bands = [
                 "pace of marks, s/m; inf lethal; nan as the prior map says",
                 "kind: 0 pace, 1 lethal, 2 clear; nan nothing said",
             ]
-            write_raster(out, [pace, said], grid, descriptions=bands, tags={"terrain": terrain}, nodata=np.nan)
+            write_raster(out, [pace, kinds], grid, descriptions=bands, tags={"terrain": terrain}, nodata=np.nan)
         else:
             write_layers(out, [mark_layer(grid, kind, pace)], MapFrame(grid))
     many = sum(len(each.kinds) for each in marks)

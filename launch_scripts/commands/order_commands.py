@@ -200,17 +200,17 @@ def give(where: Where, as_json: bool, *orders: dict[str, Any], at: str | None = 
         if sent and not any(info.plans_to_places for info in found):
             raise ConfigError(where.plans_no_places)
         for order in made:
-            said: dict[str, Any] = {}
+            place_fields: dict[str, Any] = {}
             if isinstance(order, GiveOrder) and place is not None:
                 frame = frame_of_run(bus, where)
                 cell = cell_of(place, frame, "--at")
                 order = msgspec.structs.replace(order, cell=cell)
-                said = {"at": fields_of(frame, cell)}
+                place_fields = {"at": fields_of(frame, cell)}
             with progress("waiting until all processes obey"):
                 operator = Operator(bus)
                 given, acknowledged = operator.give(order)
-            told = {"obeyed_s": acknowledged.obeyed, "silent": acknowledged.silent}
-            printed.append({"given": msgspec.to_builtins(given), **told, **said})
+            outcome = {"obeyed_s": acknowledged.obeyed, "silent": acknowledged.silent}
+            printed.append({"given": msgspec.to_builtins(given), **outcome, **place_fields})
             silent |= bool(acknowledged.silent)
             if not as_json:
                 if isinstance(order, GiveOrder) and place is not None:
@@ -229,6 +229,6 @@ def print_obeyed(acknowledged: Acknowledged) -> int:
     typer.echo(f"obeyed by {number_of(len(acknowledged.obeyed), 'process')}, the last after {took_ms:.0f} ms")
     if acknowledged.silent:
         asked = len(acknowledged.silent) + len(acknowledged.obeyed)
-        said = unanswered(acknowledged.silent, asked, OBEY_S)
-        typer.echo(f"{said}; they obey as soon as they hear a keeper", err=True)
+        text = unanswered(acknowledged.silent, asked, OBEY_S)
+        typer.echo(f"{text}; they obey as soon as they hear a keeper", err=True)
     return int(bool(acknowledged.silent))

@@ -59,8 +59,8 @@ def compare(
     settings, made = settings_that_differ(found), circumstances_that_differ(found)
     numbers = figures(found)
     if as_json:
-        told = {"scenario": dict(settings), "made": dict(made), "figures": dict(numbers)}
-        typer.echo(json.dumps({"runs": [each.name for each in found], **told}, indent=2, default=str))
+        tables = {"scenario": dict(settings), "made": dict(made), "figures": dict(numbers)}
+        typer.echo(json.dumps({"runs": [each.name for each in found], **tables}, indent=2, default=str))
         return
     console = Console(highlight=False)
     for each in found:
@@ -185,8 +185,8 @@ def replay(
         if not as_json:
             typer.echo("\n".join(map(plain, _lines(row))))
     if as_json:
-        told = {"versions": others, "processes": list(map(_fields, rows)), "unreadable": refused}
-        typer.echo(json.dumps({"run": str(folder), **told}, indent=2))
+        checked = {"versions": others, "processes": list(map(_fields, rows)), "unreadable": refused}
+        typer.echo(json.dumps({"run": str(folder), **checked}, indent=2))
     else:
         outcomes = [row.outcome for row in rows if row.outcome is not None]
         events, outputs = (f"{sum(getattr(each, name) for each in outcomes):,}" for name in ("events", "outputs"))
@@ -217,8 +217,8 @@ def _lines(row: Replayed) -> Iterator[str]:
     if difference is not None:
         yield f"{who}: event {difference.event:,}, {difference.what}, at {difference.seconds:.2f} s"
         for label, output in (("recorded", difference.recorded), ("replayed", difference.replayed)):
-            shown = "nothing more" if output is None else output[:_SHOWN]
-            yield f"    {label}: {shown}{' ...' if output and len(output) > _SHOWN else ''}"
+            text = "nothing more" if output is None else output[:_SHOWN]
+            yield f"    {label}: {text}{' ...' if output and len(output) > _SHOWN else ''}"
     elif outcome.damaged is not None:
         yield f"{who}: {recorded.path} is {outcome.damaged}"
 

@@ -155,8 +155,8 @@ def run_role(
     log_to(None, part.log_format, Speaker(role, id, run_id))
     health.starts("the ground of the run")
     if not is_router:
-        with progress() as tell:
-            fetch_if_missing(scenario, run_dir, found, roles=(role,), progress=tell)
+        with progress() as show:
+            fetch_if_missing(scenario, run_dir, found, roles=(role,), progress=show)
     generation = run_options.next_incarnation(run_dir, role, id)
     log.info("%s %s of run %s", role, id, run_id)
     setup = RoleSetup(

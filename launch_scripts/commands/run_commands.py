@@ -211,18 +211,18 @@ def ps(all: Annotated[bool, typer.Option("--all", "-a")] = False, as_json: AsJso
 
     logs = list(open_logs())
     found = [(run, len(logging_into(run.folder, logs))) for run in registered()]
-    told = [_fields(run, processes) for run, processes in found if all or run.launchers or processes]
+    entries = [_fields(run, processes) for run, processes in found if all or run.launchers or processes]
     if as_json:
-        typer.echo(json.dumps(told, indent=2))
+        typer.echo(json.dumps(entries, indent=2))
         return
     table = columns("run", "scenario", "state", "began", "seconds", "processes", "router", "live page", "folder")
     for column in table.columns:
         column.justify = "left"
-    for each in told:
+    for each in entries:
         table.add_row(*(plain("" if value is None else str(value)) for value in each.values()))
     # A row is one line, which a narrow terminal breaks: a copied folder is whole.
     Console(highlight=False, markup=False, width=1000).print(
-        table if told else "no run of yours runs here; see `swarm ps -a`"
+        table if entries else "no run of yours runs here; see `swarm ps -a`"
     )
 
 
@@ -296,17 +296,17 @@ def logs(
         has = choice(process, names, " it has ") if names else "; it has no logs"
         raise ConfigError(f"run {found[0].name} has no log of {process!r}{has}")
     width, read = max(map(len, names), default=0), dict[int, int]()
-    told: Iterable[_Line] = _new_lines(folders, process, read)
-    told = told if lines is None else deque(told, maxlen=lines)
+    unread: Iterable[_Line] = _new_lines(folders, process, read)
+    unread = unread if lines is None else deque(unread, maxlen=lines)
     with suppress(KeyboardInterrupt), stop_requests() as stopping:
         while not stopping():
-            for _, name, text in told:
+            for _, name, text in unread:
                 typer.echo(plain(text) if process else f"{name:<{width}} | {plain(text)}")
             if not follow:
                 return
             follow = bool(_launchers_now(found) or _processes(found))  # once more after its end
             time.sleep(_TURN_S)
-            told = _new_lines(folders, process, read)
+            unread = _new_lines(folders, process, read)
 
 
 @command(app, RUN)
@@ -400,8 +400,8 @@ def _chosen(name: str | None, only: bool = False) -> list[KnownRun]:
             raise ConfigError("no run of yours is registered on this machine; `swarm up SCENARIO` starts one")
         running = list(dict.fromkeys(each.name for each in known if each.launchers))
         if only and len(running) > 1:
-            told = ", ".join(running)
-            raise ConfigError(f"found {len(running)} runs here, expected the name or folder of one: {told}")
+            names = ", ".join(running)
+            raise ConfigError(f"found {len(running)} runs here, expected the name or folder of one: {names}")
         name = known[0].name
         say_newest(name, running[1:])
     return [_run_in(folder.resolve()) for folder in find_parts(name, RUNS)]

@@ -213,8 +213,8 @@ class Where(Tls):
 def say_newest(run: str, others: Iterable[str]) -> None:
     """Says which run a command asks, if others run too. A run of several launchers is one."""
     if names := list(dict.fromkeys(name for name in others if name not in ("", run))):
-        told = ", ".join(names[:_NAMED])
-        typer.echo(f"asking run {run}, the newest; also running: {told} (--run NAME)", err=True)
+        text = ", ".join(names[:_NAMED])
+        typer.echo(f"asking run {run}, the newest; also running: {text} (--run NAME)", err=True)
 
 
 def find_swarm(runs: Path | None = None, name: str | None = None) -> list[tuple[str, NetworkConfig]]:

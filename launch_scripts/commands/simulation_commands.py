@@ -112,9 +112,9 @@ def _simulate_once(
         folder = done.record_to = make_run_dir(runs, f"{new_run_id()}-simulated")
         for sentence in begin_run(folder, scenario, folder.name, simulated=True):
             terminal.say(sentence, "yellow")
-        with progress() as tell:
+        with progress() as show:
             began_s = time.perf_counter()
-            report = run_to_end(done, tell)
+            report = run_to_end(done, show)
             took_s = time.perf_counter() - began_s
     if as_json:
         numbers = {name: value for name, value in report.items() if name != "by_vehicle"}
@@ -123,10 +123,10 @@ def _simulate_once(
         terminal.report(report)
     report = with_series({**report, "run_id": folder.name}, done.recorder, done.terrain)
     write_report(folder, report, done.recorder, done.terrain, truth=done.truth)
-    log_told = "" if trace is None else f"; event log in {trace}"
+    log_text = "" if trace is None else f"; event log in {trace}"
     terminal.say(
         f"{scenario.seconds:g} simulated seconds in {took_s:.1f} s: "
-        f"{scenario.seconds / took_s:.1f} times real time, {done.deliveries:,} deliveries{log_told}"
+        f"{scenario.seconds / took_s:.1f} times real time, {done.deliveries:,} deliveries{log_text}"
     )
     terminal.say(f"report: {folder / 'report.html'}, numbers: {folder / 'report.json'}")
 
@@ -159,14 +159,14 @@ def simulate_seeds(name: str | None, seeds: str, seconds: float | None, as_json:
         typer.echo(json.dumps({**total, "results": msgspec.to_builtins(results)}, indent=2))
         return not failing
     faults = sum((Counter(each) for each in figures), Counter())
-    told = ", ".join(
+    text = ", ".join(
         f"{many:.0f} {name.removeprefix('faults.').replace('_', ' ')}"
         for name, many in faults.items()
         if name.startswith("faults.")
     )
     typer.echo(
         f"{number_of(len(some), 'seed')}, {len(some) * seconds:g} simulated seconds in "
-        f"{sum(each.wall_s for each in results):.0f} s; {told}\n"
+        f"{sum(each.wall_s for each in results):.0f} s; {text}\n"
         f"longest wait without a reason {waits_s:.1f} s, all routed at most {routed_s:.2f} s after the last fault"
     )
     for failure in failing:
@@ -253,9 +253,9 @@ def _run(sweep: Sweep, console: Console, workers: int, scheduler: str | None, st
     from launch_scripts.launcher.console import progress
 
     failed, done = 0, sweep.trials - len(sweep.missing)
-    with progress() as tell:
+    with progress() as show:
 
-        def told(trial: Trial, result: Result | None) -> None:
+        def on_result(trial: Trial, result: Result | None) -> None:
             nonlocal failed, done
             done += 1
             failed += bool(result is not None and result.broken)
@@ -263,8 +263,8 @@ def _run(sweep: Sweep, console: Console, workers: int, scheduler: str | None, st
                 console.print(f"{trial.world} seed {trial.seed} broke a law: {law}")
             if result is None:
                 console.print(f"{trial.world} seed {trial.seed} is given up: each worker that ran it died")
-            tell(f"{done:,} of {sweep.trials:,} trials, {failed:,} broke a law", done / sweep.trials)
+            show(f"{done:,} of {sweep.trials:,} trials, {failed:,} broke a law", done / sweep.trials)
             if stopping():
                 raise KeyboardInterrupt
 
-        sweep.run(workers, scheduler, told)
+        sweep.run(workers, scheduler, on_result)

@@ -16,7 +16,7 @@ from rich.text import Text
 
 from launch_scripts.commands.shared_options import Where
 from launch_scripts.launcher import console as terminal
-from launch_scripts.launcher.console import Tell, progress
+from launch_scripts.launcher.console import Progress, progress
 from launch_scripts.observe import run_state as facts
 from launch_scripts.observe.latest_messages import LatestState
 from launch_scripts.observe.run_folders import pids_of
@@ -114,14 +114,14 @@ class Status:
 
 
 def observed(
-    bus: Bus, where: Where, least_s: float = _LISTEN_S, tell: Tell = lambda what, share: None
+    bus: Bus, where: Where, least_s: float = _LISTEN_S, show: Progress = lambda what, share: None
 ) -> OutsideObserver:
     """Context of an observer that has received the state of all processes which reply in time. Raises BusError if
     no process replies."""
     clock, observer = MonotonicClock(), OutsideObserver(bus)
     began_s = time.monotonic()
     while (spent_s := time.monotonic() - began_s) < _MOST_S and not (spent_s >= least_s and observer.whole):
-        tell(f"asking the swarm: {len(observer.answers)} processes have answered", spent_s / _MOST_S)
+        show(f"asking the swarm: {len(observer.answers)} processes have answered", spent_s / _MOST_S)
         observer.listen(clock, 0.1)
     if observer.latest is None:
         admitted = "" if where.tls_ca is None else ", and does the router admit this certificate"
@@ -131,8 +131,8 @@ def observed(
 
 def ask_status(where: Where) -> Status:
     """A running swarm as it is now. Raises BusError if no process replies."""
-    with progress(f"asking the swarm {where}") as tell, where.bus() as bus:
-        return status_of(observed(bus, where, tell=tell), MonotonicClock().now_ns())
+    with progress(f"asking the swarm {where}") as show, where.bus() as bus:
+        return status_of(observed(bus, where, show=show), MonotonicClock().now_ns())
 
 
 def status_of(observer: OutsideObserver, now_ns: int) -> Status:
@@ -160,8 +160,8 @@ def print_status(status: Status, console: Console) -> None:
         for line in facts.lines(state):
             say(line)
     if silent := status.silent:
-        told = unanswered(silent, len(silent) + len(status.members), _MOST_S)
-        say(f"{told}; this machine or the network may be too busy: ask again", "yellow")
+        text = unanswered(silent, len(silent) + len(status.members), _MOST_S)
+        say(f"{text}; this machine or the network may be too busy: ask again", "yellow")
     console.print(_processes(status))
     newest = max(info.wire_version for info in status.members)
     if older := [info for info in status.members if info.wire_version < newest]:
@@ -204,12 +204,12 @@ def _processes(status: Status) -> Table:
     for info in status.members:
         stats = status.latest.newest_stats(info.role, info.id)
         counts = {} if stats is None else stats.counts
-        told = (counts.get(name) for name in ("messages_out", "messages_in", "payloads_dropped"))
+        values = (counts.get(name) for name in ("messages_out", "messages_in", "payloads_dropped"))
         up_s = max(status.now_ns - info.incarnation, 0) / NS_PER_S
         leading = {True: ", leads", False: ", stands by", None: ""}[status.latest.leads.get((info.role, info.id))]
         name = f"{info.role}-{info.id}"
         pid = str(status.pids.get(name, "-"))
-        crew.add_row(f"{name}{leading}", pid, facts.seconds(up_s), *(facts.count(n) for n in told))
+        crew.add_row(f"{name}{leading}", pid, facts.seconds(up_s), *(facts.count(n) for n in values))
     return crew
 
 
@@ -219,12 +219,12 @@ def vehicles_table(status: Status) -> Table:
     def place(at: Any) -> str:
         return f"cell:{at['row']},{at['col']}" if isinstance(at, dict) else str(at or "-")
 
-    shown = terminal.columns("vehicle", "class", "state", "to", "at")
-    for column in shown.columns:
+    table = terminal.columns("vehicle", "class", "state", "to", "at")
+    for column in table.columns:
         column.justify = "left"
     for each in status.vehicles():
-        shown.add_row(each["id"], each["vehicle_class"] or "-", each["state"], place(each["to"]), place(each["at"]))
-    return shown
+        table.add_row(each["id"], each["vehicle_class"] or "-", each["state"], place(each["to"]), place(each["at"]))
+    return table
 
 
 def status_fields(status: Status) -> dict[str, Any]:
@@ -303,12 +303,12 @@ def show_top(where: Where, *, each: bool, once: bool, as_json: bool) -> None:
 def table_of(run: RunInfo, state: RunState, processes: list[ProcessLoad], console: Console, *, each: bool) -> Group:
     """The run at an instant, at most 80 columns wide."""
     load = terminal.loads_table(processes, each=each)
-    title = Text(f"run {run.run_id}, scenario {run.scenario}, {facts.fact('elapsed_s').shown(state)}", style="bold")
+    title = Text(f"run {run.run_id}, scenario {run.scenario}, {facts.fact('elapsed_s').format(state)}", "bold")
     alarms = (Text(line, style="red") for line in facts.alarm_lines(state, _SHOWN_ON_TOP))
     return terminal.fitted(state, [title, *map(Text, facts.lines(state)), *alarms, Text(), load], console)
 
 
 def top_fields(run: RunInfo, state: RunState, processes: list[ProcessLoad]) -> dict[str, Any]:
     """The same for programs."""
-    told = list(map(asdict, processes))
-    return {"run_id": run.run_id, "scenario": run.scenario, **facts.for_report(state), "processes": told}
+    loads = list(map(asdict, processes))
+    return {"run_id": run.run_id, "scenario": run.scenario, **facts.for_report(state), "processes": loads}

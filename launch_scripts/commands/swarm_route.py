@@ -194,9 +194,9 @@ def _route(answer: Answer, cells: list[int]) -> DescribedRoute:
 def _lethal(answer: Answer) -> str:
     reply = answer.reply
     places = [cell for cell in (reply.lethal_target, reply.nearest_cell) if cell is not None]
-    shown = [written(answer.frame, cell) if cell < answer.frame.grid.cells else "outside" for cell in places]
-    nearest = f"the nearest cell that can be reached is {shown[1]}" if shown[1:] else "no cell near it is open"
-    return f"{TargetStatus.LETHAL}: {reply.target} is on lethal ground, {shown[0]}; {nearest}"
+    texts = [written(answer.frame, cell) if cell < answer.frame.grid.cells else "outside" for cell in places]
+    nearest = f"the nearest cell that can be reached is {texts[1]}" if texts[1:] else "no cell near it is open"
+    return f"{TargetStatus.LETHAL}: {reply.target} is on lethal ground, {texts[0]}; {nearest}"
 
 
 def show(answer: Answer) -> None:

@@ -86,8 +86,8 @@ def info(
     else:
         ground = msgspec.convert({"source": file, **given}, TerrainConfig)
         scenario = Scenario(terrain=ground, cost=CostConfig(preset=preset))  # type: ignore[arg-type]  # which it checks
-    with progress() as tell:
-        terrain = build_terrain(scenario, tell)
+    with progress() as show:
+        terrain = build_terrain(scenario, show)
     facts = {**facts_of(terrain), "slope_rule": scenario.cost.slope_rule, "preset": scenario.cost.preset or "none"}
     notes, doubts = notes_and_doubts(terrain, facts)
     if as_json:
@@ -95,8 +95,8 @@ def info(
         console.print_json(json.dumps({**facts, "zones": zones, "notes": notes, "doubts": doubts}))
         return
     for key, value in facts.items():
-        shown = ", ".join(f"{k} {v:.1%}" for k, v in value.items()) if isinstance(value, dict) else str(value)
-        _say(f" {key:19}  {shown}")
+        text = ", ".join(f"{k} {v:.1%}" for k, v in value.items()) if isinstance(value, dict) else str(value)
+        _say(f" {key:19}  {text}")
     _say(*lines_of(notes, doubts))
 
 
@@ -137,16 +137,16 @@ def cost(
     check_target(out, "--out", *TIFF, force=force)
     check_target(picture, "--picture", ".png", force=force)
     loaded = find_scenario(scenario, preset, crs)
-    with progress() as tell:
+    with progress() as show:
         started = time.perf_counter()
-        terrain = class_terrains(loaded, build_terrain(loaded, tell), [vehicle_class])[vehicle_class]
+        terrain = class_terrains(loaded, build_terrain(loaded, show), [vehicle_class])[vehicle_class]
         seconds = time.perf_counter() - started
         if out is not None:
             pace = np.where(np.isfinite(terrain.pace_s_per_m), terrain.pace_s_per_m, np.float32(-1))
             bands = ["pace, seconds per metre; -1 lethal"]
             about = {"TIFFTAG_IMAGEDESCRIPTION": said_of_cost(of_class(loaded, vehicle_class).cost)}
             write_raster(out, [pace], terrain.grid, descriptions=bands, unit="s/m", tags=about, nodata=-1.0)
-            tell("writing", 1.0)
+            show("writing", 1.0)
     name = loaded.name if loaded.name != "unnamed" else Path(loaded.terrain.source).stem
     _draw(terrain, picture, name)
     finite = terrain.pace_s_per_m[np.isfinite(terrain.pace_s_per_m)]
@@ -200,8 +200,8 @@ def generate(
         rivers=rivers,
         roads=roads,
     )
-    with progress() as tell:
-        terrain = build_terrain(Scenario(seed=seed, terrain=config), tell)
+    with progress() as show:
+        terrain = build_terrain(Scenario(seed=seed, terrain=config), show)
     grid = GridSpec(rows, cols, resolution_m, 500_000.0, 5_200_000.0, "EPSG:32632")
     write_raster(out, [terrain.elevation_m], grid, descriptions=["height, m"])
     if photo is not None:
@@ -259,11 +259,11 @@ def reach(
         return
     if found.fastest_s is not None:
         best = f"the best takes {found.fastest_s:.0f} s"
-        said = f"{found.share:.1%} of the cells are on a way of at most {longest_s:.0f} s; {best}"
+        summary = f"{found.share:.1%} of the cells are on a way of at most {longest_s:.0f} s; {best}"
     else:
         furthest = f"{longest_s:.0f} s from the furthest"
-        said = f"from {found.share:.1%} of the cells, in {median_s:.0f} s from the median one and {furthest}"
-    _say(said, found.rule)
+        summary = f"from {found.share:.1%} of the cells, in {median_s:.0f} s from the median one and {furthest}"
+    _say(summary, found.rule)
     _say_written(reach=out)
 
 
@@ -300,8 +300,8 @@ def classify(
         crs=crs,
         resolution_m=resolution_m,
     )
-    with progress() as tell:
-        terrain = build_terrain(Scenario(terrain=config), tell)
+    with progress() as show:
+        terrain = build_terrain(Scenario(terrain=config), show)
     _say(_shares(terrain))
     if labels is not None:
         _compare(terrain, labels)

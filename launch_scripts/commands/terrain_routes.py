@@ -14,7 +14,7 @@ import numpy as np
 import typer
 from numpy.typing import NDArray
 
-from launch_scripts.observe.palette import said_length
+from launch_scripts.observe.palette import format_length
 from launch_scripts.report import MISSIONS, gis_formats
 from planner_service.route_finder import RouteFinder
 from shared_map.array_files import Floats
@@ -126,10 +126,10 @@ def layers_of(route: DescribedRoute, ending: str) -> list[gis_formats.Layer]:
     if route.height_m is not None:
         columns["height_m"] = route.height_m.round(2)
     columns |= steps
-    told = zip(*(column.tolist() for column in columns.values()), strict=True)
+    records = zip(*(column.tolist() for column in columns.values()), strict=True)
     points = [
         gis_formats.Feature([place], dict(zip(columns, each, strict=True)))
-        for place, each in zip(xy_m[:, None, :2], told, strict=True)
+        for place, each in zip(xy_m[:, None, :2], records, strict=True)
     ]
     types: dict[str, gis_formats.FieldKind] = {
         name: "int" if name in ("row", "col") else "real" for name in columns
@@ -159,7 +159,7 @@ def write_route(route: DescribedRoute, path: Path) -> None:
     from launch_scripts.report.plots_and_figures import draw_route
 
     up_m, down_m = route.climb_m or (0.0, 0.0)
-    title = f"{route.name}: {said_length(float(f'{route.length_m:.4g}'))} in {route.cost_s:.0f} s"
+    title = f"{route.name}: {format_length(float(f'{route.length_m:.4g}'))} in {route.cost_s:.0f} s"
     title += f", {up_m:.0f} m up, {down_m:.0f} m down"
     draw_route(route.terrain, path, title, route.metres(), route.at_m, route.height_m)
 
@@ -248,14 +248,14 @@ def _check_open(scenario: Scenario, terrain: Terrain, cell: int, option: str, ot
     grid, frame = terrain.grid, MapFrame(terrain.grid)
     kind = [*TerrainClass][terrain.classes.reshape(-1)[cell]].name.lower()
     seconds = terrain.pace_s_per_m if lethal[other] else finder_for(scenario, terrain, other).cost_to_go_s()
-    told = f"{option} is on lethal ground, {written(frame, cell)}, class {kind}: no way leads there"
+    fault = f"{option} is on lethal ground, {written(frame, cell)}, class {kind}: no way leads there"
     if closing := closing_zones(scenario.cost, grid, cell):
-        told += f"; closed by {' and '.join(closing)} (cost.zones)"
+        fault += f"; closed by {' and '.join(closing)} (cost.zones)"
     else:
-        told += f"; ground above {scenario.cost.max_slope_deg:g} degrees is lethal (--preset, cost.max_slope_deg)"
+        fault += f"; ground above {scenario.cost.max_slope_deg:g} degrees is lethal (--preset, cost.max_slope_deg)"
     if (near := nearest_open(np.isfinite(seconds), *grid.row_col(cell))) is not None:
-        told += f"; the nearest place that can be reached is {written(frame, grid.cell(*near))}"
-    raise TerrainError(told)
+        fault += f"; the nearest place that can be reached is {written(frame, grid.cell(*near))}"
+    raise TerrainError(fault)
 
 
 # --- from everywhere --------------------------------------------------------------------------------------------
@@ -384,8 +384,8 @@ def write_reach(found: Reach, path: Path, every_s: float | None, slack: float) -
     if path.suffix.lower() in (".tif", ".tiff"):
         seconds = np.where(np.isfinite(found.seconds), found.seconds, np.float32(-1))
         description = f"{gis_formats.COSTS} {found.rule}"
-        told, tags = ["seconds of travel, -1 no way"], {"TIFFTAG_IMAGEDESCRIPTION": description}
-        gis_formats.write_raster(path, [seconds], found.grid, descriptions=told, unit="s", tags=tags, nodata=-1.0)
+        texts, tags = ["seconds of travel, -1 no way"], {"TIFFTAG_IMAGEDESCRIPTION": description}
+        gis_formats.write_raster(path, [seconds], found.grid, descriptions=texts, unit="s", tags=tags, nodata=-1.0)
         return
     if every_s is None:
         every_s = _BAND_S if found.fastest_s is None else max(found.fastest_s * slack / _SLACK_BANDS, 1e-3)

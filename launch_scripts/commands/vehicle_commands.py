@@ -130,15 +130,15 @@ def remove(names: list[str], where: Where, as_json: AsJson = False) -> int:
                 raise ConfigError(f"no agent {agent} takes part {where}; it has {there}")
             asked.setdefault(agent, []).append(name)
         # A request that names the agent itself means all of its vehicles, which an empty list expresses.
-        said = {agent: _remove(bus, agent, [] if agent in some else some) for agent, some in asked.items()}
-    for one in said.values():
+        replies = {agent: _remove(bus, agent, [] if agent in some else some) for agent, some in asked.items()}
+    for one in replies.values():
         if one.unknown:
             raise ConfigError(f"agent {one.agent} hosts no {', '.join(one.unknown)}")
         if not as_json:
             typer.echo(f"{', '.join(one.left)}: left" + (f"; {one.held} still hold cells" if one.held else ""))
     if as_json:
-        typer.echo(json.dumps({agent: {"left": one.left, "held": one.held} for agent, one in said.items()}))
-    return int(any(one.held for one in said.values()))
+        typer.echo(json.dumps({agent: {"left": one.left, "held": one.held} for agent, one in replies.items()}))
+    return int(any(one.held for one in replies.values()))
 
 
 @command(app)
@@ -164,17 +164,17 @@ def forget(name: str, where: Where) -> None:
 def _remove(bus: Bus, agent: str, vehicles: list[str]) -> Removed:
     """Asks until the cells of all that left are free, but not for ever."""
     until_s = time.monotonic() + _WITHIN_S
-    said: Removed | None = None
+    last: Removed | None = None
     while time.monotonic() < until_s:
         replies, _ = replies_to(bus, LEAVE, RemoveVehicles(vehicles=vehicles), _ANSWERS_S, agent=agent)
         removed = [reply for reply in replies if isinstance(reply, Removed)]
-        if said is not None and not removed:
-            return replace(said, held=0)  # an added agent ends once leaders know that its last vehicle has left
+        if last is not None and not removed:
+            return replace(last, held=0)  # an added agent ends once leaders know that its last vehicle has left
         if removed:
-            said = removed[0]
-        if said is not None and not said.held:
-            return said
+            last = removed[0]
+        if last is not None and not last.held:
+            return last
         time.sleep(_AGAIN_S)
-    if said is None:
+    if last is None:
         raise BusError(f"agent {agent} does not answer")
-    return said
+    return last

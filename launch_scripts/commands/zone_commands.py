@@ -15,7 +15,7 @@ import typer
 from launch_scripts.commands.order_commands import print_obeyed
 from launch_scripts.commands.shared_options import AsJson, Where, duration
 from launch_scripts.observe.run_observer import frame_of_run
-from launch_scripts.plain_text import said_duration
+from launch_scripts.plain_text import format_duration
 from launch_scripts.typer_commands import command, family_app
 from shared_map.terrain.map_frame import MapFrame
 from swarm.config.ground import ZoneConfig
@@ -150,8 +150,8 @@ def _give(orders_on: Callable[[MapFrame], Iterable[ZoneOrder]], where: Where, as
     obeyed = {process: took_s for _, each in given for process, took_s in each.obeyed.items()}
     silent = sorted({process for _, each in given for process in each.silent})
     if as_json:
-        told = {"changed": zones.changed, "obeyed_s": obeyed, "silent": silent}
-        typer.echo(json.dumps({**_fields(zones, frame), **told}, indent=2))
+        outcome = {"changed": zones.changed, "obeyed_s": obeyed, "silent": silent}
+        typer.echo(json.dumps({**_fields(zones, frame), **outcome}, indent=2))
         return int(bool(silent))
     for then, _ in given:
         stands = [_line(zone, frame) for zone in then.zones if zone.name == then.changed]
@@ -160,21 +160,21 @@ def _give(orders_on: Callable[[MapFrame], Iterable[ZoneOrder]], where: Where, as
 
 
 def _fields(zones: Zones, frame: MapFrame) -> dict[str, object]:
-    shown = [
+    rows = [
         {**msgspec.to_builtins(zone), "corners": [fields_of(frame, cell) for cell in _ends(zone, frame)]}
         for zone in zones.zones
     ]
-    return {"crs": frame.grid.crs, "zones": shown}
+    return {"crs": frame.grid.crs, "zones": rows}
 
 
 def _line(zone: Zone, frame: MapFrame) -> str:
     row0, col0, row1, col1 = zone.window
     kind = "lethal" if zone.pace_s_per_m is None else f"pace {zone.pace_s_per_m:g} s/m"
-    left = "" if zone.until_ns is None else f", ends in {said_duration(max(zone.until_ns / 1e9 - time.time(), 0))}"
+    end = "" if zone.until_ns is None else f", ends in {format_duration(max(zone.until_ns / 1e9 - time.time(), 0))}"
     within = f"{zone.cells} cells in rows {row0}-{row1 - 1}, cols {col0}-{col1 - 1}"
     ends = " to ".join(written(frame, cell) for cell in _ends(zone, frame))
     whom = "" if zone.vehicle_class is None else f" for {zone.vehicle_class}"
-    return f"zone {zone.name}: {kind}{whom}, {within}{left}" + (f"; {ends}" if ends else "")
+    return f"zone {zone.name}: {kind}{whom}, {within}{end}" + (f"; {ends}" if ends else "")
 
 
 def _ends(zone: Zone, frame: MapFrame) -> list[int]:

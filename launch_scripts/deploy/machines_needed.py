@@ -203,7 +203,7 @@ def fewest_machines(machine: Machine, swarm: Swarm, standbys: int = 0) -> Needs:
 
 def too_much(found: Needs, machine: Machine) -> list[str]:
     """Returns a sentence per resource beyond its limit. No further machine helps those that begin with "one"."""
-    said = [
+    sentences = [
         f"one {role} process takes {share:.2f} of a core"
         for role, share in sorted(found.process.items(), key=lambda each: -each[1])
         if share > USED_SHARE and role != "router"
@@ -214,7 +214,7 @@ def too_much(found: Needs, machine: Machine) -> list[str]:
         ("link", found.first_link_mbit_per_s, LINK_SHARE, machine.link_mbit_per_s, " Mbit/s"),
         ("sessions of a router", found.sessions, 1.0, MOST_SESSIONS, ""),
     )
-    return said + [
+    return sentences + [
         f"{what}: {taken:,.1f} of {there:,g}{unit}"
         for what, taken, share, there, unit in limits
         if taken > share * there

@@ -33,7 +33,7 @@ from swarm.files import discard_output
 
 log = logging.getLogger(__name__)
 
-Tell = Callable[[str, float], None]
+Progress = Callable[[str, float], None]
 """Called with the current step and the share of it that is done."""
 _PATIENCE_S = 1.0
 """Shorter work has no progress line."""
@@ -42,7 +42,7 @@ _PLAIN_EVERY_S = 5.0
 _BUSY_EVERY_S = 0.2
 """Interval of what changes in its place. Chosen, not measured."""
 _TABLE_EVERY_S = 1.0
-"""The table's content is made once a second (`Recorder.shown`)."""
+"""The table's content is made once a second (`Recorder.summary`)."""
 _READER_GONE = frozenset((errno.EPIPE, errno.EIO, errno.EBADF, errno.ENXIO))
 """Errors of a pipe, and of a terminal, without a reader."""
 
@@ -158,7 +158,7 @@ def _busy_line(
     began_s = time.monotonic()
     over = threading.Event()
 
-    def tell() -> None:
+    def show() -> None:
         if over.wait(_PATIENCE_S):
             return
         line = Live(console=console, auto_refresh=False, transient=True) if changes else contextlib.nullcontext()
@@ -172,7 +172,7 @@ def _busy_line(
                 if over.wait(_BUSY_EVERY_S if changes else _PLAIN_EVERY_S):
                     return
 
-    thread = threading.Thread(target=tell, name="busy-line", daemon=True)
+    thread = threading.Thread(target=show, name="busy-line", daemon=True)
     thread.start()
     try:
         yield
@@ -182,19 +182,19 @@ def _busy_line(
 
 
 @contextlib.contextmanager
-def progress(what: str = "working") -> Iterator[Tell]:
+def progress(what: str = "working") -> Iterator[Progress]:
     """Yields a function that reports progress, on a terminal only and after the first second.
 
     what  the work, until that function says more
     """
     console, now = Console(stderr=True), [what]
 
-    def tell(what: str, share: float) -> None:
+    def update(what: str, share: float) -> None:
         now[0] = f"{what}, {share:.0%}"
 
-    shown = _busy_line(console, console.print, lambda: now[0], changes=True)
-    with shown if console.is_terminal else contextlib.nullcontext():
-        yield tell
+    line = _busy_line(console, console.print, lambda: now[0], changes=True)
+    with line if console.is_terminal else contextlib.nullcontext():
+        yield update
 
 
 class OutlivingOutput:
@@ -236,13 +236,13 @@ def make_output_outlive_readers() -> None:
 
 def what_is_left(run_dir: Path) -> list[str]:
     """A line for each thing to look at that is there."""
-    lines = [f"{name}: {_shown(run_dir / file)}" for name, file in _FILES if (run_dir / file).is_file()]
+    lines = [f"{name}: {_relative(run_dir / file)}" for name, file in _FILES if (run_dir / file).is_file()]
     beside = Path(sys.executable).with_name("rerun")
-    viewer = "rerun" if shutil.which("rerun") or not beside.exists() else _shown(beside)
+    viewer = "rerun" if shutil.which("rerun") or not beside.exists() else _relative(beside)
     # More than one where the monitor was started again: oldest first.
     recordings = [path for path in run_dir.glob("run*.rrd") if path.stat().st_size]
     recordings.sort(key=lambda path: (len(path.name), path.name))
-    return [*lines, *(f"recording: {viewer} {_shown(path)}" for path in recordings)]
+    return [*lines, *(f"recording: {viewer} {_relative(path)}" for path in recordings)]
 
 
 def tunnel(port: int) -> str:
@@ -250,7 +250,7 @@ def tunnel(port: int) -> str:
     return f"ssh -N -L {port}:127.0.0.1:{port} {os.environ.get('USER', 'USER')}@{socket.gethostname()}"
 
 
-def _shown(path: Path) -> str:
+def _relative(path: Path) -> str:
     """A path as one would type it here: relative to the present folder if it is below that."""
     try:
         return str(path.relative_to(here)) if (here := Path.cwd()) != Path("/") else str(path)
@@ -293,13 +293,13 @@ def fitted(state: RunState, above: list[RenderableType], console: Console) -> Gr
 def targets_table(state: RunState, most: int, *, always: bool = True) -> Table:
     """A line for each target, `most` at most, with the main columns, or with the remaining ones."""
     labels, rows = facts.table(state, always=always)
-    shown = columns(*labels)
+    table = columns(*labels)
     kept = most if len(rows) <= most else most - 1
     for line, row in list(zip(state.targets, rows, strict=True))[:kept]:
-        shown.add_row(*row, style=_style(line))
+        table.add_row(*row, style=_style(line))
     if len(rows) > kept:
-        shown.add_row(f"... {len(rows) - kept} more")
-    return shown
+        table.add_row(f"... {len(rows) - kept} more")
+    return table
 
 
 def columns(*labels: str) -> Table:
@@ -313,12 +313,12 @@ def columns(*labels: str) -> Table:
 def plain_line(state: RunState, title: str) -> str:
     """The state in one line."""
     names = ("captures", "reroute_requests", "marks", "messages_now_per_s", "certified_gap")
-    told = "".join(f", {text}" for text in facts.measured(names, state))
+    figures = "".join(f", {text}" for text in facts.measured(names, state))
     alarms = "".join(f"; {line}" for line in facts.alarm_lines(state, SHOWN_ALARMS))
     return (
         f"{title}: {facts.fact('processes_well').labelled(state)}, "
-        f"restarts {state.restarts}; vehicles {facts.fact('vehicles_driven').shown(state)}: "
-        f"{facts.fact('states').shown(state)}{told}{alarms}"
+        f"restarts {state.restarts}; vehicles {facts.fact('vehicles_driven').format(state)}: "
+        f"{facts.fact('states').format(state)}{figures}{alarms}"
     )
 
 
@@ -339,7 +339,7 @@ def loads_table(processes: Sequence[ProcessLoad], *, each: bool) -> Table:
         table.add_column("busiest", no_wrap=True, overflow="ellipsis")
     for name, mine in groups.items():
         alive, first = [line for line in mine if line.alive], mine[0]
-        row = [name, *(shown(alive, mine) for shown in _LOADS.values())]
+        row = [name, *(cell(alive, mine) for cell in _LOADS.values())]
         if each:
             row[1:1] = [str(first.pid or "-"), facts.seconds(first.up_s) if alive else "gone"]
         else:

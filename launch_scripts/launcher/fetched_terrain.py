@@ -39,14 +39,14 @@ def find_members(scenario: Scenario) -> list[RunInfo]:
     Waits for a router, and for a keeper if files of the terrain are missing here. Says once what it waits for.
     """
     missing = missing_files(scenario)
-    said = False
+    warned = False
     with open_bus(scenario.network, patient=True) as bus:
         while True:
             found = ask_run(bus, routers=True)
             if not missing or any(info.role == "keeper" for info in found):
                 return found
-            if not said:
-                said = True
+            if not warned:
+                warned = True
                 log.warning("there is no file %s here: waiting for a keeper, which hands it out", missing[0])
 
 
@@ -76,7 +76,7 @@ def fetch_if_missing(
             " where the file is"
         )
     key = scenario_key(scenario)
-    looks = any(TABLE[role].photo for role in roles)
+    photo = any(TABLE[role].photo for role in roles)
     with writing(run_dir):
         lock = (run_dir / "terrain.lock").open("wb")
     with lock:
@@ -86,10 +86,10 @@ def fetch_if_missing(
             here = load_prepared(run_dir, key)
         except TerrainError as error:
             log.warning("fetching the terrain again: %s", error)
-        if here is not None and (here.photo.any() or not looks):
+        if here is not None and (here.photo.any() or not photo):
             return
         log.info("%s: asking the keepers of run %s for the base map", why, found[0].run_id)
-        layers = (*NEEDED, "photo") if looks else NEEDED
+        layers = (*NEEDED, "photo") if photo else NEEDED
         with open_bus(scenario.network, authenticator=authenticator_of(scenario.network, found[0].run_id)) as bus:
             within_s = 2 * scenario.network.connect_timeout_s  # so slow a link is one that a start may wait for
             terrain = fetch_base_map(bus, found[0].terrain, scenario.cost, why, layers, within_s, progress)

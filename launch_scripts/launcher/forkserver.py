@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 ROLES_ONLY, ROLES_AND_KERNELS = "roles", "roles and kernels"
 LOADS = "SWARM_FORKSERVER_LOADS"
-"""The variable of the environment that tells the forkserver which of the two to load."""
+"""The variable of the environment that names which of the two the forkserver loads."""
 _HELD_BACK = {signal.SIGINT, signal.SIGTERM, signal.SIGHUP}
 _BACKGROUND = 5
 """Niceness of what compiles kernels that no first route needs."""
@@ -115,12 +115,12 @@ class WarmUp:
 
     def _build(self) -> None:
         """The first builder replies once the forkserver has loaded everything, and names the missing kernels."""
-        pipes = [self._builder(tells=True)]
+        pipes = [self._builder(is_first=True)]
         first, others = pipes[0].recv()
         self._first, self._left = set(first), {*first, *others}
         self._all = len(self._left)
         if self._left:
-            pipes += [self._builder(tells=False) for _ in range(1, min(len(os.sched_getaffinity(0)), 8))]
+            pipes += [self._builder(is_first=False) for _ in range(1, min(len(os.sched_getaffinity(0)), 8))]
         while pipes:
             if not self._first:
                 self._ready.set()
@@ -134,25 +134,25 @@ class WarmUp:
                 self._first.discard(name)
                 self._left.discard(name)
 
-    def _builder(self, *, tells: bool) -> Connection:
-        """Starts a builder. Returns the pipe on which it tells what it has compiled."""
-        listens, tell = self._context.Pipe(duplex=False)
+    def _builder(self, *, is_first: bool) -> Connection:
+        """Starts a builder. Returns the pipe on which it reports what it has compiled."""
+        receiver, sender = self._context.Pipe(duplex=False)
         with self._lock, forking():
             if not self._closed:
-                builder = self._context.Process(target=_build, args=(tell, self._scenario, tells), daemon=True)
+                builder = self._context.Process(target=_build, args=(sender, self._scenario, is_first), daemon=True)
                 builder.start()
                 self._builders.append(builder)
-        tell.close()
-        return listens
+        sender.close()
+        return receiver
 
 
-def _build(tell: Connection, scenario: Scenario | None, tells: bool) -> None:
+def _build(sender: Connection, scenario: Scenario | None, is_first: bool) -> None:
     """Compiles missing kernels, together with the other builders, and reports the name of each.
 
-    tells  at first which are missing: those for a first route, and the others. Without a scenario there are none
+    is_first  reports which are missing: those for a first route, and the others. Without a scenario there are none
     """
     if scenario is None:
-        _say(tell, ([], []))
+        _say(sender, ([], []))
         return
     from planner_service.kernel_build import build, can_build, missing, name_of, needed_kernels, place_kernels
 
@@ -161,19 +161,19 @@ def _build(tell: Connection, scenario: Scenario | None, tells: bool) -> None:
     # The places process starts with these: before kernels which only make planners faster.
     later = [k for k in dict.fromkeys([*place_kernels(scenario).first, *needed.later]) if k not in needed.first]
     first, others = (missing(needed.first), missing(later)) if can_build() else ((), ())
-    if tells:
-        _say(tell, (list(map(name_of, first)), list(map(name_of, others))))
+    if is_first:
+        _say(sender, (list(map(name_of, first)), list(map(name_of, others))))
     for kernels, niceness in ((first, 0), (others, _BACKGROUND)):
         if kernels:
             os.nice(niceness)
-            build(kernels, lambda kernel: _say(tell, name_of(kernel)))
+            build(kernels, lambda kernel: _say(sender, name_of(kernel)))
 
 
-def _say(tell: Connection, what: object) -> None:
+def _say(sender: Connection, what: object) -> None:
     """Reports to the launcher. A launcher that has refused its scenario meanwhile has closed the pipe; its user
     must see no traceback of that."""
     with contextlib.suppress(OSError):
-        tell.send(what)
+        sender.send(what)
 
 
 def _end_with_launcher() -> None:

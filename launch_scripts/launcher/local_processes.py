@@ -3,8 +3,8 @@
 A process hangs if it had the processor and did not tick. On a machine that is far too busy time alone proves
 nothing: a process that compiles or imports there is nearly done when it is killed, and begins again.
 
-The main thread of a process runs its loop. At each look of the launcher, time is added to a sum; at `STILL_S` the
-process hangs. `passed` is the time since the look before, `used` what of it the main thread had a processor for.
+The main thread of a process runs its loop. At each check of the launcher, time is added to a sum; at `STILL_S` the
+process hangs. `passed` is the time since the check before, `used` what of it the main thread had a processor for.
 
 | its loop | its main thread now | a processor was idle | added |
 |---|---|---|---|
@@ -47,11 +47,11 @@ from swarm.runtime.role_setup import RoleSetup
 STILL_S = 60.0
 """A loop that has not ticked for this time does not recover. Much longer than `HUNG_S`, from which on probes fail:
 restarts do not help an overloaded machine."""
-LOOK_EVERY_S = 1.0
+CHECK_EVERY_S = 1.0
 """A sixtieth of `STILL_S`, so what hangs is found in time; the launcher's loop turns ten to twenty times as
 often."""
-_MOST_PER_LOOK_S = 2.0
-"""Two looks. More between two of them was no time in which the launcher turned: it was stopped, and so were its
+_MOST_PER_CHECK_S = 2.0
+"""Two checks. More between two of them was no time in which the launcher turned: it was stopped, and so were its
 processes."""
 _STARVED = 0.1
 """Share of its sleep that counts for a process on a machine without an idle processor."""
@@ -78,21 +78,21 @@ class Stillness:
     """The newest stamp on its board while its loop runs."""
     still_s: float = 0.0
     sight: Sight | None = None
-    """The look before; None if it had ticked then."""
+    """The check before; None if it had ticked then."""
 
-    def needs_look(self, stamp_ns: int) -> bool:
-        """Returns True if the process has to be looked at: it has not ticked since the last look."""
+    def needs_check(self, stamp_ns: int) -> bool:
+        """Returns True if the process has to be checked: it has not ticked since the last check."""
         if stamp_ns and stamp_ns == self.stamp_ns:
             return True
         self.stamp_ns, self.still_s, self.sight = stamp_ns, 0.0, None
         return False
 
     def hangs(self, sight: Sight, passed_s: float, idle: bool) -> bool:
-        """Adds what a look shows of a process which has not ticked. Returns True if it hangs."""
+        """Adds what a check shows of a process which has not ticked. Returns True if it hangs."""
         before, self.sight = self.sight, sight
         if before is not None:
             used_s = max(sight.used_s - before.used_s, 0.0)
-            slept_s = 0.0 if sight.runnable else max(min(passed_s, _MOST_PER_LOOK_S) - used_s, 0.0)
+            slept_s = 0.0 if sight.runnable else max(min(passed_s, _MOST_PER_CHECK_S) - used_s, 0.0)
             self.still_s += used_s + slept_s * (1.0 if idle else _STARVED)
         return self.still_s >= STILL_S
 
@@ -261,7 +261,7 @@ class LocalSwarm:
         self._setup_of = setup_of
         self._log_dir = log_dir
         self._log_format = log_format
-        self._looked_s = 0.0
+        self._checked_s = 0.0
         self._idle = IdleTime()
         self._context = multiprocessing.get_context("forkserver")
 
@@ -303,7 +303,7 @@ class LocalSwarm:
         self._let_go()
         self._end_hung()
         endings = []
-        # One look at all: to ask each for its exit code costs a system call and a selector each time.
+        # One check of all: to ask each for its exit code costs a system call and a selector each time.
         ended = wait([running.process.sentinel for running in self.running if running.process is not None], 0)
         for running in self.running:
             process = running.process
@@ -334,15 +334,15 @@ class LocalSwarm:
         """Ends processes which hang. First SIGABRT: the process logs the stacks of all its threads.
         If it still runs after `STOP_GRACE_S`, SIGKILL."""
         now_s = time.monotonic()
-        passed_s = now_s - self._looked_s
-        if passed_s < LOOK_EVERY_S:
+        passed_s = now_s - self._checked_s
+        if passed_s < CHECK_EVERY_S:
             return
-        self._looked_s = now_s
+        self._checked_s = now_s
         idle: bool | None = None
         for running in self.running:
             vitals = running.seen().vitals
             stamp_ns = vitals.stamp_ns if vitals is not None and vitals.phase is Phase.RUNS else 0
-            if not running.stillness.needs_look(stamp_ns):
+            if not running.stillness.needs_check(stamp_ns):
                 continue
             idle = self._idle.any_until(now_s) if idle is None else idle
             sight = sight_of(running.pid)
@@ -388,7 +388,7 @@ class LocalSwarm:
             of_role = [running for running in self.alive if running.spec.role == role]
             if of_role and not force():
                 ask(of_role, STOP_GRACE_S)
-                failures += [said for running in of_role if (said := self._failure(running, force())) is not None]
+                failures += [why for running in of_role if (why := self._failure(running, force())) is not None]
         leaving = [running for running in self.alive if running.ended_as_asked]
         wait_until(lambda: all(each.exitcode is not None for each in leaving), STOP_GRACE_S)
         for running in leaving:
@@ -411,7 +411,7 @@ class LocalSwarm:
 
     def _start(self, running: Running) -> None:
         restarts = running.restarts + bool(running.began_s)
-        listen, tell = self._context.Pipe(duplex=False)
+        receiver, sender = self._context.Pipe(duplex=False)
         spec = running.spec
         setup = self._setup_of(spec)
         if running.health is None:
@@ -423,12 +423,12 @@ class LocalSwarm:
         )
         # Daemons: should the launcher itself fail, multiprocessing ends them.
         entry, log_path = spec.entry or TABLE[spec.role].entry, self._log_dir / f"{spec.name}.log"
-        arguments = (entry, setup, log_path, self._log_format, running.health, tell)
+        arguments = (entry, setup, log_path, self._log_format, running.health, sender)
         process = self._context.Process(target=run_child, args=arguments, name=spec.name, daemon=True)
         with forking():
             process.start()
-        tell.close()
-        running.process, running.pipe, running.last_word = process, listen, None
+        sender.close()
+        running.process, running.pipe, running.last_word = process, receiver, None
         running.began_s, running.due_s, running.hung_s = time.monotonic(), None, None
         running.restarts = restarts
 
@@ -470,12 +470,12 @@ class LocalSwarm:
     def _failure(self, running: Running, force: bool) -> str | None:
         """Returns the reason why a process that was asked to end has not done so, in words; it is forgotten if it
         has ended."""
-        code, said = running.exitcode, None
+        code, reason = running.exitcode, None
         if running.ended_as_asked or (code is None and force):
             return None
         if code is None:
-            said = f"{running.spec.name} did not end within {STOP_GRACE_S:g} s and was killed"
+            reason = f"{running.spec.name} did not end within {STOP_GRACE_S:g} s and was killed"
         elif code not in (0, -signal.SIGTERM):  # SIGTERM itself, if it came before the handler
-            said = f"{running.spec.name} was asked to end, but {self._exit_reason(running, code).sentence}"
+            reason = f"{running.spec.name} was asked to end, but {self._exit_reason(running, code).sentence}"
         running.end()
-        return said
+        return reason

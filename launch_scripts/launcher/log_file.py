@@ -57,7 +57,7 @@ class JsonLines(logging.Formatter):
 
     def format(self, record: logging.LogRecord) -> str:
         time = datetime.fromtimestamp(record.created, UTC).isoformat(timespec="milliseconds")
-        told = {
+        fields = {
             "time": time.replace("+00:00", "Z"),
             "level": record.levelname.lower(),
             **self._speaker,
@@ -65,10 +65,10 @@ class JsonLines(logging.Formatter):
             "message": record.getMessage(),
         }
         if record.exc_info:
-            told["exception"] = self.formatException(record.exc_info)
+            fields["exception"] = self.formatException(record.exc_info)
         if record.stack_info:
-            told["stack"] = record.stack_info
-        return json.dumps(told)
+            fields["stack"] = record.stack_info
+        return json.dumps(fields)
 
 
 class LogFile(RotatingFileHandler):
@@ -96,8 +96,8 @@ class LogFile(RotatingFileHandler):
         super().emit(record)
         if before and self._lost == before:
             self._lost = 0
-            told = logging.LogRecord(__name__, logging.WARNING, "", 0, "%d lines were lost", (before,), None)
-            super().emit(told)
+            notice = logging.LogRecord(__name__, logging.WARNING, "", 0, "%d lines were lost", (before,), None)
+            super().emit(notice)
 
     def handleError(self, record: logging.LogRecord) -> None:  # noqa: N802 (the library calls it so)
         if isinstance(sys.exc_info()[1], OSError):

@@ -36,7 +36,7 @@ class OrderedPlanners:
     missing_s  planner -> since when it has been missing
     started_s  planner -> when it was started here last
     refused    planners that could not be started
-    told       reason why planners are not started, as the user was told last
+    reported   reason why planners are not started, as it was printed last
     """
 
     scenario: Scenario
@@ -49,7 +49,7 @@ class OrderedPlanners:
     missing_s: dict[str, float] = field(default_factory=dict)
     started_s: dict[str, float] = field(default_factory=dict)
     refused: set[str] = field(default_factory=set)
-    told: str = ""
+    reported: str = ""
 
     def follow_orders(self, book: OrderBook, alive: Collection[tuple[str, str]], now_s: float) -> None:
         """Starts missing planners, and ends unwanted ones.
@@ -73,10 +73,10 @@ class OrderedPlanners:
         free = _BEGIN_AT_ONCE - sum(("planner", id) not in alive for id in begin)
         for id in due[: max(free, 0)]:
             if (reason := self.no_room(len(wanted & here) + 1)) is not None:
-                if reason != self.told:
+                if reason != self.reported:
                     more = f" and {len(due) - 1} more" if len(due) > 1 else ""
                     self.say(f"planner-{id}{more}: not started: {reason}")
-                self.told = reason
+                self.reported = reason
                 break
             here.add(id)
             self.started_s[id] = now_s

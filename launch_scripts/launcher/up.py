@@ -139,8 +139,8 @@ class _Run:
         """The live view's start page, until the monitor serves it."""
         view = options.scenario.monitor
         if "monitor" in options.roles and view.live and view.web_port and not options.takes_over:
-            told = {"life": "", "at_s": 0.0, "name": f"{self._scenario.name}, run {run_id}"}
-            self._page = when_free(lambda: LivePage(view.web_port, lambda: {**told, "state": self._doing()}))
+            facts = {"life": "", "at_s": 0.0, "name": f"{self._scenario.name}, run {run_id}"}
+            self._page = when_free(lambda: LivePage(view.web_port, lambda: {**facts, "state": self._doing()}))
             self._say_page(view.web_port)
         if self._health.url:
             self._terminal.say(f"metrics at {self._health.url}; /healthz and /readyz beside them")
@@ -195,7 +195,7 @@ class _Run:
                 known = Recorder(self._scenario, grid, since_ns) if records else OwnPart(grid, since_ns)
                 self._known = known
                 watcher = Watcher(bus, known, MonotonicClock())
-                watcher.look_after([running.spec for running in self._swarm.running])
+                watcher.set_own([running.spec for running in self._swarm.running])
                 try:
                     self._leave_page()
                     self._swarm.start()
@@ -310,12 +310,12 @@ class _Run:
         )
         while not self._stop_asked:
             ordered.follow_orders(observed.book, set(observed.up()), time.monotonic())
-            watcher.look_after([running.spec for running in self._swarm.running])
+            watcher.set_own([running.spec for running in self._swarm.running])
             if self._take_over is not None:
                 self._take_over.advance(time.monotonic())
             self._raise_refusals(self._swarm.poll())
             watcher.listen(_TURN_S if self._startup_s is None else _CALM_TURN_S)
-            self._tell(watcher)
+            self._on_turn(watcher)
             now_s = time.monotonic()
             if self._startup_s is None and self._is_up(watcher):
                 self._startup_s = now_s - self._options.began_s
@@ -350,10 +350,10 @@ class _Run:
         specs = [running.spec for running in self._swarm.running]
         return [spec.name for spec in specs if not watcher.known.observed.was_up(spec.role, spec.id)]
 
-    def _tell(self, watcher: Watcher) -> None:
+    def _on_turn(self, watcher: Watcher) -> None:
         known = watcher.known
         up = known.own_up() if isinstance(known, OwnPart) else None
-        self._health.turned(known.observed, self._started_ns, self._missing(watcher), up)
+        self._health.on_turn(known.observed, self._started_ns, self._missing(watcher), up)
         if (sentence := self._disk.check_room(time.monotonic())) is not None:
             self._terminal.say(sentence, "red")
         for note in watcher.take_notes(starting=self._startup_s is None):

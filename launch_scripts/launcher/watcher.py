@@ -57,7 +57,7 @@ class OwnPart(LatestState):
         """The object itself; of a `Recorder`, the state that it records."""
         return self
 
-    def look_after(self, own: frozenset[ProcessSpec]) -> None:
+    def set_own(self, own: frozenset[ProcessSpec]) -> None:
         """Takes these processes for the launcher's own."""
         crew = tuple(sorted((spec.role, spec.id) for spec in own if TABLE[spec.role].is_needed))
         targets = tuple(dict.fromkeys(job_of(id) for role, id in crew if role == "planner"))
@@ -82,7 +82,7 @@ class OwnPart(LatestState):
 class Watcher(RunObserver):
     """Listens only. It is no member of the run, so that its absence changes nothing.
 
-    known  the store of received messages. An `OwnPart` receives messages of the processes in `look_after`, orders,
+    known  the store of received messages. An `OwnPart` receives messages of the processes in `set_own`, orders,
            and tokens
     """
 
@@ -105,7 +105,7 @@ class Watcher(RunObserver):
         if not isinstance(known, OwnPart):
             self.ask_gone()  # of a run that this is a part of
 
-    def look_after(self, processes: Collection[ProcessSpec]) -> None:
+    def set_own(self, processes: Collection[ProcessSpec]) -> None:
         """If another launcher records the run, receives only the messages of these processes. Call it again
         whenever the processes may have changed."""
         if not isinstance(self.known, OwnPart) or self.known.own == (own := frozenset(processes)):
@@ -114,7 +114,7 @@ class Watcher(RunObserver):
             self.forget(spec.role, spec.id)
         for spec in own - self.known.own:
             self.keep_samples_of(spec.role, spec.id)
-        self.known.look_after(own)
+        self.known.set_own(own)
 
     def end(self, own: Collection[ProcessSpec]) -> None:
         """The launcher ends its own processes: from now on, no other process counts as gone. Where this launcher's
@@ -125,8 +125,8 @@ class Watcher(RunObserver):
         """Takes in what arrives within some seconds, all of it at their end: the launcher wakes seldom."""
         time.sleep(for_s)
         self._bus.gather()
-        for heard in self.due(self.now_ns()):
-            self._inbox.post(heard)
+        for sample in self.due(self.now_ns()):
+            self._inbox.post(sample)
         until_s = time.monotonic() + _READ_S
         while (event := self._inbox.take(0.0)) is not None:
             self.take(event, self.now_ns())
@@ -136,8 +136,8 @@ class Watcher(RunObserver):
     def finish(self) -> None:
         """Takes messages that have arrived and were not due yet: no further ones come."""
         self._bus.gather()
-        for heard in self.due(self.now_ns(), all=True):
-            self.take(heard, self.now_ns())
+        for sample in self.due(self.now_ns(), all=True):
+            self.take(sample, self.now_ns())
 
     def now_ns(self) -> int:
         return self._clock.now_ns()
@@ -220,7 +220,7 @@ class LauncherHealth:
         board, seen = self._health.board, self._seen
         self._metrics = MetricsEndpoint(port, lambda: [Process(_NAME, board.read()), *seen()], address)
 
-    def turned(
+    def on_turn(
         self,
         observed: LatestState,
         started_ns: int,

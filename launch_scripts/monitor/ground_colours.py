@@ -225,7 +225,7 @@ class CostSamples:
     costs_s     target -> float32 (n, m), inf where there is no way
     """
 
-    def __init__(self, grid: GridSpec, shown: str | None) -> None:
+    def __init__(self, grid: GridSpec, displayed: str | None) -> None:
         step = max(1, math.ceil(math.sqrt(grid.cells / _MOST_SAMPLES)))
         while -(-grid.rows // step) * -(-grid.cols // step) > _MOST_SAMPLES:
             step += 1
@@ -235,7 +235,7 @@ class CostSamples:
         cells = self.rows[:, None] * grid.cols + self.cols
         self.request = CostRequest(cells=cells.reshape(-1).tolist())
         self.costs_s: dict[str, Floats] = {}
-        self._shown = shown
+        self._displayed = displayed
         self.targets: deque[str] = deque()
         """Targets with a planner, the one that was asked least lately first."""
         self._asked = 0
@@ -243,8 +243,8 @@ class CostSamples:
     def next_target(self) -> str | None:
         """The target to ask about; None while none has a planner."""
         self._asked += 1
-        if self._asked % 2 and self._shown in self.targets:
-            return self._shown
+        if self._asked % 2 and self._displayed in self.targets:
+            return self._displayed
         self.targets.rotate(-1)
         return self.targets[-1] if self.targets else None
 

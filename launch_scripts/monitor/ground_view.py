@@ -17,10 +17,10 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from launch_scripts.monitor import ground_colours, live_layout
-from launch_scripts.monitor.rerun_outputs import Pen, RateLimit, even, ragged, shown
-from launch_scripts.monitor.styles import Look
+from launch_scripts.monitor.rerun_outputs import Pen, RateLimit, even, inline, ragged
+from launch_scripts.monitor.styles import Entry
 from launch_scripts.monitor.terrain_mesh import Bytes, Floats, MeshTile, TerrainMesh
-from launch_scripts.observe.palette import round_length, said_length
+from launch_scripts.observe.palette import format_length, round_length
 from shared_map.cost_map import CostMap
 from shared_map.keeper.zone_orders import cells_of_zones
 from shared_map.replication.replica import MapReplica
@@ -107,10 +107,10 @@ class GroundView:
         cost_map: CostMap,
         replica: MapReplica,
         scenario: Scenario,
-        movers: Sequence[Look] = (),
+        movers: Sequence[Entry] = (),
     ) -> None:
         self._pen, self._mesh, self._cost_map, self._replica = scene.pen, scene.pen.mesh, cost_map, replica
-        self._shown, self._movers = scene.layers, movers
+        self._layers, self._movers = scene.layers, movers
         self._planned, self._zones = scene.zones, scene.zones
         """Zones of the scenario, and all that stand."""
         self._target_ids, self._classes = scenario.target_ids, list(class_numbers(scenario))
@@ -140,7 +140,7 @@ class GroundView:
         self._pen.log("world", rr.ViewCoordinates.RIGHT_HAND_Z_UP, static=True)
         fine, coarse = self._mesh.mesh_tiles(), self._mesh.mesh_tiles(coarser=2)
         whole = [self._mesh.whole(_WHOLE_SIDE)]
-        for layer in self._shown:
+        for layer in self._layers:
             for n, tile in enumerate(
                 fine if layer == live_layout.PHOTO else coarse if layer in self._tiled else whole
             ):
@@ -237,7 +237,7 @@ class GroundView:
             scale = live_layout.Scale(
                 ground_colours.COST_TO_GO_COLOURS, f"seconds to {layer.target}", [f"{each:g}" for each in seconds]
             )
-        picture = live_layout.legend_picture((*layer.looks, *self._movers), scale)
+        picture = live_layout.legend_picture((*layer.entries, *self._movers), scale)
         image = rr.EncodedImage(contents=picture, media_type="image/png")
         self._pen.log(f"legend/{layer.name}", image, static=True)
 
@@ -255,7 +255,7 @@ class GroundView:
         colours = np.repeat(per_zone, [len(part) for part in parts], axis=0)
         self._pen.lines("world/zones", even(np.concatenate([np.empty((0, 2, 3), np.float32), *parts])), colours)
         named = self._zones[:_NAMES_SHOWN]
-        places, titles = title_places(self._mesh, named), [shown(area.title, 60) for area in named]
+        places, titles = title_places(self._mesh, named), [inline(area.title, 60) for area in named]
         pale = (per_zone[:_NAMES_SHOWN].astype(np.uint16) + 2 * 255) // 3  # on their own hatches names would drown
         self._pen.points("world/zones/names", positions=places, labels=titles, colors=pale.astype(np.uint8))
 
@@ -273,8 +273,8 @@ class GroundView:
         corners = np.array([corner for shape in shapes for corner in shape], np.float32)
         self._pen.lines("world/margin", ragged(corners, [len(shape) for shape in shapes]))
         texts = {
-            said_length(length_m): (length_m / 2, south, 0),
-            mesh.said_heights: (mesh.width_m / 2, south, 0),
+            format_length(length_m): (length_m / 2, south, 0),
+            mesh.heights_text: (mesh.width_m / 2, south, 0),
             "N": (east - 2.2 * unit, north, 0),
         }
         places = np.array(list(texts.values()), np.float32)

@@ -17,8 +17,8 @@ from PIL import Image, ImageDraw, ImageFont
 from rerun.blueprint.encodings import TextLogColumn
 
 from launch_scripts.monitor import ground_colours as colours
-from launch_scripts.monitor.rerun_outputs import Colour, Pen, in_markdown, screen, shown
-from launch_scripts.monitor.styles import FOLLOWED_ENTITY, HINT, HUES, Level, Look, level_for
+from launch_scripts.monitor.rerun_outputs import Colour, Pen, in_markdown, inline, screen
+from launch_scripts.monitor.styles import FOLLOWED_ENTITY, HINT, HUES, Entry, Level, level_for
 from launch_scripts.monitor.terrain_mesh import TerrainMesh
 from launch_scripts.observe import palette
 from launch_scripts.observe import run_state as facts
@@ -53,62 +53,62 @@ _SHOWN_ALARMS = 8
 """Lines at the head of the same panel, chosen by eye: more of them would push the table out of it."""
 
 
-_CLOSED = (Look("hatch", colours.HATCH, "known to be lethal"), Look("hatch", colours.NO_GO, "no-go zone"))
+_CLOSED = (Entry("hatch", colours.HATCH, "known to be lethal"), Entry("hatch", colours.NO_GO, "no-go zone"))
 
 
 class Layer(NamedTuple):
     """A tab of the view.
 
-    name    of its legend
-    entity  which has the ground of this layer
-    looks   what its legend says of the ground
-    target  whose routes alone it shows; None for all
+    name     of its legend
+    entity   which has the ground of this layer
+    entries  of its legend, about the ground
+    target   whose routes alone it shows; None for all
     """
 
     name: str
     title: str
     entity: str
-    looks: tuple[Look, ...]
+    entries: tuple[Entry, ...]
     target: str | None = None
 
 
 PHOTO = Layer(
     "photo", "Photo", "world/ground",
-    (*_CLOSED, Look("fill", colours.LETHAL_MARK, "found lethal"), Look("fill", colours.SLOW_MARK, "found slow"),
-     Look("fill", colours.FAST_MARK, "found quick")),
+    (*_CLOSED, Entry("fill", colours.LETHAL_MARK, "found lethal"), Entry("fill", colours.SLOW_MARK, "found slow"),
+     Entry("fill", colours.FAST_MARK, "found quick")),
 )  # fmt: skip
-COST = Layer("cost", "Cost", "world/layers/cost", (*_CLOSED, Look("fill", colours.LETHAL_PRIOR, "found lethal")))
+COST = Layer("cost", "Cost", "world/layers/cost", (*_CLOSED, Entry("fill", colours.LETHAL_PRIOR, "found lethal")))
 KNOWN = Layer(
     "known", "Known and true", "world/layers/known",
-    (Look("fill", colours.FOUND, "hidden, and found"),
-     Look("fill", colours.STILL_HIDDEN_LETHAL, "lethal, not yet found"),
-     Look("fill", colours.STILL_HIDDEN_SLOW, "slower or quicker, not yet found"),
-     Look("fill", colours.OVERRULED, "marked or ordered, yet not so")),
+    (Entry("fill", colours.FOUND, "hidden, and found"),
+     Entry("fill", colours.STILL_HIDDEN_LETHAL, "lethal, not yet found"),
+     Entry("fill", colours.STILL_HIDDEN_SLOW, "slower or quicker, not yet found"),
+     Entry("fill", colours.OVERRULED, "marked or ordered, yet not so")),
 )  # fmt: skip
 LEARNED = Layer("learned", "Learned", "world/layers/learned", _CLOSED)
 TO_TARGET = Layer(
     "to_target", "To", "world/layers/to_target",
-    (Look("line", colours.TREE, "where the cost falls most"), Look("fill", colours.UNREACHED, "no way from here"),
-     Look("fill", colours.LETHAL_PRIOR, "lethal")),
+    (Entry("line", colours.TREE, "where the cost falls most"), Entry("fill", colours.UNREACHED, "no way from here"),
+     Entry("fill", colours.LETHAL_PRIOR, "lethal")),
 )  # fmt: skip
 NEAREST = Layer("nearest", "Nearest target", "world/layers/nearest", ())
 
 
-def shown_layers(scenario: Scenario, *, knows_truth: bool) -> list[Layer]:
+def layers_of(scenario: Scenario, *, knows_truth: bool) -> list[Layer]:
     """The layers of a run, in order of their tabs."""
     targets = scenario.target_ids
-    shown = [PHOTO, COST]
+    layers = [PHOTO, COST]
     if knows_truth:
-        shown.append(KNOWN)
+        layers.append(KNOWN)
     if scenario.map.learning:
-        shown.append(LEARNED)
+        layers.append(LEARNED)
     if targets:
         target = scenario.monitor.show_target or targets[0]
-        shown.append(TO_TARGET._replace(title=f"To {target}", target=target))
+        layers.append(TO_TARGET._replace(title=f"To {target}", target=target))
     if len(targets) > 1:
-        nearest = (Look("fill", hue, f"nearest: {id}") for id, hue in zip(targets, HUES, strict=False))
-        shown.append(NEAREST._replace(looks=tuple(nearest)))
-    return shown
+        nearest = (Entry("fill", hue, f"nearest: {id}") for id, hue in zip(targets, HUES, strict=False))
+        layers.append(NEAREST._replace(entries=tuple(nearest)))
+    return layers
 
 
 class Scale(NamedTuple):
@@ -119,7 +119,7 @@ class Scale(NamedTuple):
     texts: Sequence[str]
 
 
-def legend_picture(looks: Sequence[Look], scale: Scale | None = None) -> bytes:
+def legend_picture(entries: Sequence[Entry], scale: Scale | None = None) -> bytes:
     """A PNG of `WIDTH_PX` x `HEIGHT_PX`."""
     image = Image.new("RGB", (WIDTH_PX, HEIGHT_PX), BACKGROUND)
     draw = ImageDraw.Draw(image)
@@ -129,28 +129,28 @@ def legend_picture(looks: Sequence[Look], scale: Scale | None = None) -> bytes:
         left += _SCALE_PX + 2 * _GAP_PX
     for rows, size in _ROWS:
         font = ImageFont.load_default(size)
-        columns = [looks[first : first + rows] for first in range(0, len(looks), rows)]
-        widths = [_TEXT_PX + max(font.getlength(look.meaning) for look in column) + _GAP_PX for column in columns]
+        columns = [entries[first : first + rows] for first in range(0, len(entries), rows)]
+        widths = [_TEXT_PX + max(font.getlength(entry.meaning) for entry in column) + _GAP_PX for column in columns]
         if left + sum(widths) <= WIDTH_PX:
             break
     for column, width in zip(columns, widths, strict=True):
-        for row, look in enumerate(column):
+        for row, entry in enumerate(column):
             middle = round((row + 0.5) * HEIGHT_PX / rows)
-            image.paste(_swatch(look), (round(left), middle - _SWATCH_PX[1] // 2))
-            draw.text((left + _TEXT_PX, middle), look.meaning, _TEXT, font, anchor="lm")
+            image.paste(_swatch(entry), (round(left), middle - _SWATCH_PX[1] // 2))
+            draw.text((left + _TEXT_PX, middle), entry.meaning, _TEXT, font, anchor="lm")
         left += width
     file = io.BytesIO()
     image.save(file, "PNG", compress_level=1)  # of a scale that changes all the time most of the work is to pack it
     return file.getvalue()
 
 
-def _swatch(look: Look) -> Image.Image:
+def _swatch(entry: Entry) -> Image.Image:
     width, height = (_FINE * side for side in _SWATCH_PX)
     image = Image.new("RGB", (width, height), BACKGROUND)
     draw = ImageDraw.Draw(image)
-    middle, colour, thick = width // 2, look.colour, 2 * _FINE
+    middle, colour, thick = width // 2, entry.colour, 2 * _FINE
     square, whole = (middle - height // 2, 0, middle + height // 2 - 1, height - 1), (0, 0, width - 1, height - 1)
-    match look.shape:
+    match entry.shape:
         case "fill":
             draw.rectangle(whole, colour, _TEXT, _FINE // 2)
         case "hatch":
@@ -178,7 +178,7 @@ def _draw_scale(image: Image.Image, draw: ImageDraw.ImageDraw, scale: Scale) -> 
 
 
 def make_blueprint(
-    mesh: TerrainMesh, shown: Sequence[Layer] = (PHOTO,), *, vehicles: int = 100, follow: str | None = None
+    mesh: TerrainMesh, layers: Sequence[Layer] = (PHOTO,), *, vehicles: int = 100, follow: str | None = None
 ) -> rrb.Blueprint:
     """Layers of the 3D view on the left, each with its legend; figures, plots and the log on the right.
 
@@ -187,7 +187,7 @@ def make_blueprint(
     """
     return rrb.Blueprint(
         rrb.Horizontal(
-            rrb.Tabs(*(_layer(mesh, layer, vehicles, follow) for layer in shown), active_tab=0),
+            rrb.Tabs(*(_layer(mesh, layer, vehicles, follow) for layer in layers), active_tab=0),
             rrb.Vertical(
                 rrb.TextDocumentView(origin="/summary", name="Now"),
                 _plot("captures_and_marks", "Captures and marks"),
@@ -230,18 +230,18 @@ def _view_3d(mesh: TerrainMesh, layer: Layer, vehicles: int, follow: str | None)
         contents += ["- /world/routes/**", f"+ /world/routes/{layer.target}"]
     far = max(mesh.width_m, mesh.depth_m)
     if follow:  # the followed one is the origin of the view: the world moves below it
-        eye, look = (-0.02 * far, -0.16 * far, 0.11 * far), (0.0, 0.0, 0.0)
+        eye, centre = (-0.02 * far, -0.16 * far, 0.11 * far), (0.0, 0.0, 0.0)
     else:
         east, north, up = mesh.width_m / 2, -mesh.depth_m / 2, float(mesh.heights_m.mean())
-        eye, look = (east - 0.05 * far, north - 0.84 * far, up + 0.62 * far), (east, north - 0.19 * far, up)
+        eye, centre = (east - 0.05 * far, north - 0.84 * far, up + 0.62 * far), (east, north - 0.19 * far, up)
     return rrb.Spatial3DView(
         origin=f"/{FOLLOWED_ENTITY}" if follow else "/world",
         contents=contents,
-        name=", ".join((layer.title, mesh.said_heights, f"following {follow}" if follow else HINT)),
+        name=", ".join((layer.title, mesh.heights_text, f"following {follow}" if follow else HINT)),
         background=rrb.Background(color=BACKGROUND),
         line_grid=rrb.LineGrid3D(visible=False),
         eye_controls=rrb.EyeControls3D(
-            kind=rrb.Eye3DKind.Orbital, position=eye, look_target=look, eye_up=(0, 0, 1)
+            kind=rrb.Eye3DKind.Orbital, position=eye, look_target=centre, eye_up=(0, 0, 1)
         ),
         overrides=_sizes(level_for(vehicles)),
         defaults=[rr.Mesh3D.from_fields(albedo_factor=_BARE)],
@@ -321,7 +321,7 @@ class FiguresPanel:
 
     def note(self, text: str, level: str) -> None:
         """Logs a line, at a level as rerun names it."""
-        self._pen.log("log", rr.TextLog(shown(text), level=level))
+        self._pen.log("log", rr.TextLog(inline(text), level=level))
 
 
 def level_of(kind: str) -> str:
@@ -332,7 +332,7 @@ def level_of(kind: str) -> str:
 def summary_markdown(setup: RoleSetup, state: RunState) -> str:
     """The state of a run, as Markdown."""
     time = facts.fact("elapsed_s")
-    lines = [f"**{in_markdown(setup.scenario.name)}**, {time.label} {time.shown(state)}  "]
+    lines = [f"**{in_markdown(setup.scenario.name)}**, {time.label} {time.format(state)}  "]
     lines += [f"{line}  " for line in facts.lines(state)]
     lines += [f"**{in_markdown(line)}**  " for line in facts.alarm_lines(state, _SHOWN_ALARMS)]
     labels, rows = facts.table(state)

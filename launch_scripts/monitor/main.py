@@ -30,8 +30,8 @@ def run(setup: RoleSetup, built: Callable[[], None]) -> None:
         view, page = setup.scenario.monitor, None
         if view.live:
             name = f"{setup.scenario.name}, run {setup.run_id}"
-            told = {"life": "", "at_s": 0.0, "name": name, "state": "its processes have begun"}
-            page = when_free(lambda: LivePage(view.web_port, lambda: told, terrain))
+            facts = {"life": "", "at_s": 0.0, "name": name, "state": "its processes have begun"}
+            page = when_free(lambda: LivePage(view.web_port, lambda: facts, terrain))
             stack.callback(page.server.close)
         network = setup.scenario.network
         bus = stack.enter_context(

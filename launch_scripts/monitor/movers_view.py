@@ -17,8 +17,8 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from launch_scripts.monitor import styles
-from launch_scripts.monitor.rerun_outputs import LABEL_COLOUR, Pen, RateLimit, Strips, even, ragged, screen, shown
-from launch_scripts.monitor.styles import ALARM_COLOUR, FOLLOWED_ENTITY, Level, Looks, dimmed
+from launch_scripts.monitor.rerun_outputs import LABEL_COLOUR, Pen, RateLimit, Strips, even, inline, ragged, screen
+from launch_scripts.monitor.styles import ALARM_COLOUR, FOLLOWED_ENTITY, Colours, Level, dimmed
 from launch_scripts.monitor.terrain_mesh import Bytes, Floats, TerrainMesh
 from launch_scripts.observe.alarms import Alarm
 from launch_scripts.observe.latest_messages import LatestState, VehicleColumns
@@ -141,15 +141,15 @@ def trails_of(scenario: Scenario, mesh: TerrainMesh, level: Level) -> Trails:
 class VehiclesView:
     """Vehicles as balls with a sentence each, their trails and routes."""
 
-    def __init__(self, pen: Pen, scenario: Scenario, level: Level, looks: Looks) -> None:
-        self._pen, self._mesh, self._level, self._looks = pen, pen.mesh, level, looks
+    def __init__(self, pen: Pen, scenario: Scenario, level: Level, colours: Colours) -> None:
+        self._pen, self._mesh, self._level, self._colours = pen, pen.mesh, level, colours
         self._target_ids = scenario.target_ids
         self._ids: list[str] = []
         """Vehicles that were drawn last, and their metadata. Rebuilt when a vehicle joins or leaves."""
         self._who: dict[str, str] = {}
         """Vehicle -> its group, and its class where that is not "ground"."""
         self._rows = np.empty(0, np.intp)
-        """Rows of `Looks.vehicles`, by group."""
+        """Rows of `Colours.vehicles`, by group."""
         self._aloft: list[tuple[NDArray[np.intp], Floats]] = []
         """For each flying class the indices of its vehicles in `_ids`, and `TerrainMesh.aloft_m`."""
         self._routes: dict[str, RouteNow] = {}
@@ -161,8 +161,8 @@ class VehiclesView:
 
     def begin(self) -> None:
         """Logs the styles, which never change."""
-        for id in self._looks.target_ids:
-            self._pen.style(f"world/routes/{id}", self._level.line_px, self._looks.route(id))
+        for id in self._colours.target_ids:
+            self._pen.style(f"world/routes/{id}", self._level.line_px, self._colours.route(id))
         self._pen.style("world/trails/vehicles", 0.8 * self._level.line_px)
         self._pen.label_style("world/vehicles/names")
 
@@ -193,12 +193,12 @@ class VehiclesView:
         for flying, over_m in self._aloft:
             positions[flying, 2] += over_m.reshape(-1)[cells[flying]]
         rows = self._rows
-        if self._looks.by_target:
-            rows = np.array([*self._looks.rows(vehicles.target_ids), -1], np.intp)[vehicles.targets]
-        colours, told = self._looks.vehicles(rows, vehicles.states), None
+        if self._colours.by_target:
+            rows = np.array([*self._colours.rows(vehicles.target_ids), -1], np.intp)[vehicles.targets]
+        colours, details = self._colours.vehicles(rows, vehicles.states), None
         if self._limit.due("details", now_ns, slower):
-            told = vehicle_details(vehicles, self._who, self._routes, now_ns)
-        self._pen.points("world/vehicles", {"vehicle": told}, positions=positions, colors=colours)
+            details = vehicle_details(vehicles, self._who, self._routes, now_ns)
+        self._pen.points("world/vehicles", {"vehicle": details}, positions=positions, colors=colours)
         if self._level.names and len(positions) <= self._level.most:
             above = np.array([0, 0, 0.8 * self._mesh.scale_m], np.float32)
             self._pen.points("world/vehicles/names", positions=positions + above, labels=vehicles.ids)
@@ -215,7 +215,7 @@ class VehiclesView:
         self._who = {
             id: group if classes[id] == GROUND else f"{group}, {classes[id]}" for id, group in groups.items()
         }
-        self._rows = np.array(self._looks.rows([groups.get(id) for id in ids]), np.intp)
+        self._rows = np.array(self._colours.rows([groups.get(id) for id in ids]), np.intp)
         self._aloft = [
             (np.flatnonzero([classes.get(id) == name for id in ids]), over_m)
             for name, over_m in self._mesh.aloft_m.items()
@@ -293,8 +293,8 @@ class MoversView:
     ) -> None:
         self._pen, self._mesh, self._observed, self._counters = pen, pen.mesh, observed, counters
         self._level = level = styles.level_for(scenario.vehicle_count)
-        self.looks = styles.Looks([group.name for group in scenario.groups], scenario.target_ids)
-        self._vehicles = VehiclesView(self._pen, scenario, level, self.looks)
+        self.colours = styles.Colours([group.name for group in scenario.groups], scenario.target_ids)
+        self._vehicles = VehiclesView(self._pen, scenario, level, self.colours)
         self._follow = scenario.monitor.follow
         self._trails = trails_of(scenario, pen.mesh, level)
         self._sightings = Sightings(filter)
@@ -359,7 +359,7 @@ class MoversView:
         marks = alarm_marks(summary.alarms, summary.elapsed_s, observed.targets(), self._mesh.grid.resolution_m)
         tops = self._pen.placed(list(marks), _ALARM)
         self._pen.lines("world/alarms/poles", poles(self._mesh, tops))
-        self._pen.points("world/alarms/marks", positions=tops, labels=[shown(text, 60) for text in marks.values()])
+        self._pen.points("world/alarms/marks", positions=tops, labels=[inline(text, 60) for text in marks.values()])
 
     def tick(self, now_ns: int, watched: bool) -> None:
         """Draws one frame's due parts."""
@@ -392,7 +392,7 @@ class MoversView:
         self._pen.lines("world/targets/sighted", rings(self._mesh, centres, radii_m))
         self._draw_labels("world/targets/sighted/names", centres, 1.0, list(labels.values()))
         ids, tops = list(places_m), self._pen.placed(list(places_m.values()), _PIN)
-        colours = np.array([self.looks.target(id, id in lost) for id in ids], np.uint8).reshape(-1, 3)
+        colours = np.array([self.colours.target(id, id in lost) for id in ids], np.uint8).reshape(-1, 3)
         self._pen.points("world/targets/balls", {"target": ids}, positions=tops, colors=colours)
         self._pen.lines("world/targets/poles", poles(self._mesh, tops), colours)
         named = [n for n, id in enumerate(ids) if id in pins]
@@ -405,25 +405,25 @@ class MoversView:
     def _draw_goals(self, goals: Sequence[GoalState], vehicles: VehicleColumns) -> None:
         """Draws a flag at each place to which a vehicle was sent, and a line from the vehicle to it."""
         grid, row = self._mesh.grid, {id: n for n, id in enumerate(vehicles.ids)}
-        ways = [(each, row[each.name], each.cell) for each in goals if each.name in row and each.cell is not None]
-        ways = [way for way in ways if way[2] < grid.cells]
-        cells = np.array([cell for _, _, cell in ways], np.int64)
+        sent = [(goal, row[goal.name], goal.cell) for goal in goals if goal.name in row and goal.cell is not None]
+        sent = [each for each in sent if each[2] < grid.cells]
+        cells = np.array([cell for _, _, cell in sent], np.int64)
         tops = self._mesh.place_cells(cells, _FLAG * self._mesh.scale_m)
-        hues = [ALARM_COLOUR if each.state == "blocked" else styles.FLAG_COLOUR for each, _, _ in ways]
+        hues = [ALARM_COLOUR if goal.state == "blocked" else styles.FLAG_COLOUR for goal, _, _ in sent]
         colours: Bytes = np.array(hues, np.uint8).reshape(-1, 3)
-        told = [f"{each.name}: {each.state}" for each, _, _ in ways]
-        self._pen.points("world/goals/flags", {"goal": told}, positions=tops, colors=colours)
+        states = [f"{goal.name}: {goal.state}" for goal, _, _ in sent]
+        self._pen.points("world/goals/flags", {"goal": states}, positions=tops, colors=colours)
         self._pen.lines("world/goals/poles", poles(self._mesh, tops), colours)
         starts = self._pen.placed(
-            [(float(vehicles.east_m[n]), float(vehicles.south_m[n])) for _, n, _ in ways], 0.2
+            [(float(vehicles.east_m[n]), float(vehicles.south_m[n])) for _, n, _ in sent], 0.2
         )
         ends = feet(self._mesh, tops)
         self._pen.lines("world/goals/ways", even(np.stack([starts, ends], axis=1)), colours)
-        sent: dict[int, list[str]] = {}  # one label a place: that of a vehicle alone would read like the vehicle
-        for each, _, cell in ways:
-            sent.setdefault(cell, []).append(each.name)
+        names: dict[int, list[str]] = {}  # one label a place: that of a vehicle alone would read like the vehicle
+        for goal, _, cell in sent:
+            names.setdefault(cell, []).append(goal.name)
         _, first = np.unique(cells, return_index=True)
-        texts = [f"place of {first_of(sent[int(cells[n])])}" for n in first]
+        texts = [f"place of {first_of(names[int(cells[n])])}" for n in first]
         self._draw_labels("world/goals/names", tops[first], 1.0, texts)
 
     def _draw_labels(self, entity: str, places: Floats, above: float, texts: list[str]) -> None:
@@ -447,10 +447,10 @@ class MoversView:
 
     def _draw_beliefs(self, now_ns: int) -> None:
         """Draws where targets are believed to be; one without cells is no longer searched."""
-        heard = self._believed.items()
-        self._believed = {id: each for id, each in heard if each[0].cells and now_ns - each[1] < SILENT_NS}
-        told = [believed for believed, _ in self._believed.values()]
-        places, colours, radii_m, sentences = searched_points(self._mesh, told)
+        received = self._believed.items()
+        self._believed = {id: each for id, each in received if each[0].cells and now_ns - each[1] < SILENT_NS}
+        beliefs = [believed for believed, _ in self._believed.values()]
+        places, colours, radii_m, sentences = searched_points(self._mesh, beliefs)
         its = {"positions": places, "colors": colours, "radii": radii_m}
         self._pen.points("world/searched", {"searched": sentences}, **its)
 

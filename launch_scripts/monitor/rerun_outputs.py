@@ -60,7 +60,7 @@ _LONGEST = 300
 panel."""
 
 
-def shown(text: str, most: int = _LONGEST) -> str:
+def inline(text: str, most: int = _LONGEST) -> str:
     """A text in one line of characters that every viewer has; `?` stands for others."""
     line = _UNSHOWN.sub("?", " ".join(text.split()))
     return line if len(line) <= most else line[: most - 3] + "..."
@@ -68,7 +68,7 @@ def shown(text: str, most: int = _LONGEST) -> str:
 
 def in_markdown(text: str) -> str:
     """The same where Markdown is read: it says itself and does nothing."""
-    return _MARKDOWN.sub(r"\\\1", shown(text))
+    return _MARKDOWN.sub(r"\\\1", inline(text))
 
 
 class Strips(NamedTuple):
@@ -165,10 +165,10 @@ class Pen:
         fresh = self.news(entity, **parts)
         if "labels" in fresh:
             fresh["labels"] = pa.array(fresh["labels"], pa.string())
-        told = self.news(entity, **(sentences or {}))
-        told = {name: pa.array(each, pa.string()) for name, each in told.items()}
-        if fresh or told:
-            more = [rr.AnyValues(**told)] if told else []
+        changed = self.news(entity, **(sentences or {}))
+        changed = {name: pa.array(each, pa.string()) for name, each in changed.items()}
+        if fresh or changed:
+            more = [rr.AnyValues(**changed)] if changed else []
             self.log(entity, rr.Points3D.from_fields(**fresh), *more)
 
     def lines(self, entity: str, strips: Strips, colours: Bytes | None = None) -> None:

@@ -98,7 +98,7 @@ class MonitorService(MemberService):
         self._sync = MapSync(replica, bus, post, scenario.map, setup.role)
         self._panel = live_layout.FiguresPanel(scene.pen, scenario.target_ids)
         self._movers = MoversView(scene.pen, scenario, self.observed, self.counters, replica.filter)
-        self._ground = GroundView(scene, terrain, cost_map, replica, scenario, self._movers.looks.legend())
+        self._ground = GroundView(scene, terrain, cost_map, replica, scenario, self._movers.colours.legend())
         self._observer = RunObserver(bus, post, self.observed, _READ)
         self._watched = False
         self._drawn_for = 0
@@ -147,8 +147,8 @@ class MonitorService(MemberService):
             self._draw_frame(now_ns, audience.ever)
 
     def stop(self, now_ns: int) -> None:
-        for heard in self._observer.due(now_ns, all=True):
-            self._hear(heard, now_ns)
+        for sample in self._observer.due(now_ns, all=True):
+            self._hear(sample, now_ns)
         self.observed.touch(now_ns)
         self._limit.all_due()
         self._ground.finish()
@@ -163,10 +163,10 @@ class MonitorService(MemberService):
 
     # --- in -----------------------------------------------------------------------------------------------------
 
-    def _hear(self, heard: Heard, now_ns: int) -> None:
-        self._observer.take(heard, now_ns)
-        self._movers.on_observed(heard.message, now_ns)
-        match heard.message:
+    def _hear(self, event: Heard, now_ns: int) -> None:
+        self._observer.take(event, now_ns)
+        self._movers.on_observed(event.message, now_ns)
+        match event.message:
             case Fleet(stamp_ns=stamp_ns):  # not by poses: a tracker's clock may be wrong
                 self._newest_stamp_ns = max(stamp_ns, self._newest_stamp_ns)
             case PlannerStatus() as status:
@@ -198,8 +198,8 @@ class MonitorService(MemberService):
     def _draw_frame(self, now_ns: int, viewers: int) -> None:
         """Draws one frame; `viewers` is the number of those that have ever connected."""
         self._sync.tick(now_ns)
-        for heard in self._observer.due(now_ns):
-            self._hear(heard, now_ns)
+        for sample in self._observer.due(now_ns):
+            self._hear(sample, now_ns)
         self._frame += 1
         self._pen.set_time(self._frame, self.at_s)
         self._watch_recording(now_ns)
@@ -247,7 +247,7 @@ def load_view(
     mesh = TerrainMesh(seen, config.height_factor, class_terrains(scenario, seen, aloft_classes(scenario)))
     del seen
     knows_truth = scenario.terrain.hidden != HiddenConfig()
-    layers = live_layout.shown_layers(scenario, knows_truth=knows_truth)
+    layers = live_layout.layers_of(scenario, knows_truth=knows_truth)
     blueprint = live_layout.make_blueprint(mesh, layers, vehicles=scenario.vehicle_count, follow=config.follow)
     path = None if setup.run_dir is None else new_recording_path(setup.run_dir)
     sinks = Sinks(f"{setup.run_id}.{setup.incarnation:x}", path, config, blueprint, page)

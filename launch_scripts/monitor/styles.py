@@ -54,7 +54,7 @@ SHADES: dict[VehicleState, tuple[Colour, float]] = {
 """Colour mixed into a hue, and its share."""
 
 
-class Look(NamedTuple):
+class Entry(NamedTuple):
     """One line of the legend: a shape in a colour, and what it stands for."""
 
     shape: Shape
@@ -79,7 +79,7 @@ def dimmed(colours: Bytes) -> Bytes:
     return darker
 
 
-class Looks:
+class Colours:
     """The colours of one run. If all vehicles are of one group, hues are targets: vehicles, their routes and the
     target that they chase have one. With several groups they are groups, and all targets look alike."""
 
@@ -112,26 +112,26 @@ class Looks:
         hue = self._hue.get(target, ROUTE_COLOUR) if self.by_target else ROUTE_COLOUR
         return mixed(hue, (0, 0, 0), 0.15)
 
-    def legend(self) -> list[Look]:
+    def legend(self) -> list[Entry]:
         """Returns the legend of all moving entities."""
         first, target = next(iter(self._hue.values()), NOBODY), next(iter(self.target_ids), "")
         if self.by_target:
-            who = [Look("ball", first, "vehicle, hue by target")]
+            who = [Entry("ball", first, "vehicle, hue by target")]
         else:
-            who = [Look("ball", self._hue[name], f"of {name[:14]}") for name in self.groups[:_GROUPS]]
+            who = [Entry("ball", self._hue[name], f"of {name[:14]}") for name in self.groups[:_GROUPS]]
         alike: dict[Colour, list[str]] = {}
         for state in [*SHADES][1:]:  # a vehicle that is following has the hue itself
             alike.setdefault(shaded(first, state), []).append(state.name.lower())
-        states = [Look("ball", colour, ", ".join(names)) for colour, names in alike.items()]
+        states = [Entry("ball", colour, ", ".join(names)) for colour, names in alike.items()]
         return [
             *who,
             *states,
-            Look("ball", self.target(target), "target on a pole"),
-            Look("ring", SIGHTED_COLOUR, "hidden target seen"),
-            Look("ball", OBSTACLE_COLOUR, "obstacle to keep off"),
-            Look("line", self.route(target), "route, trail"),
-            Look("ball", ALARM_COLOUR, "alarm on a pole"),
-            Look("ball", FLAG_COLOUR, "place of an order"),
+            Entry("ball", self.target(target), "target on a pole"),
+            Entry("ring", SIGHTED_COLOUR, "hidden target seen"),
+            Entry("ball", OBSTACLE_COLOUR, "obstacle to keep off"),
+            Entry("line", self.route(target), "route, trail"),
+            Entry("ball", ALARM_COLOUR, "alarm on a pole"),
+            Entry("ball", FLAG_COLOUR, "place of an order"),
         ]
 
 

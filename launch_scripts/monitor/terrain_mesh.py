@@ -84,7 +84,7 @@ class TerrainMesh:
         return max(self.width_m, self.depth_m) / 100
 
     @property
-    def said_heights(self) -> str:
+    def heights_text(self) -> str:
         """Returns the exaggeration of heights, in words."""
         return "heights to scale" if self.stretch == 1 else f"heights x {self.stretch:.2g}"
 

@@ -20,7 +20,7 @@ from pathlib import Path
 import msgspec
 
 from launch_scripts.observe.latest_messages import LatestState
-from launch_scripts.plain_text import plain, said_duration, said_moment
+from launch_scripts.plain_text import format_duration, format_time, plain
 from swarm.clock import NS_PER_S
 from swarm.peers import job_of
 from swarm.wire.messages.processes import Alarm as WireAlarm
@@ -105,7 +105,7 @@ class Alarm:
     @property
     def when(self) -> str:
         """In words: `for 19 min`, `at 14:22:10`, `at 14:22:10, for 86 s`."""
-        lasted = None if self.lasted_s is None else said_duration(self.lasted_s)
+        lasted = None if self.lasted_s is None else format_duration(self.lasted_s)
         if self.over_s is not None:
             if self.since_s is None:
                 return f"until {self._at(self.over_s)}"
@@ -115,8 +115,8 @@ class Alarm:
 
     def _at(self, run_s: float) -> str:
         if self.began_ns is None:
-            return f"{said_duration(run_s)} of the run"
-        return said_moment(self.began_ns + round(run_s * NS_PER_S))
+            return f"{format_duration(run_s)} of the run"
+        return format_time(self.began_ns + round(run_s * NS_PER_S))
 
     @property
     def where(self) -> str:
@@ -146,23 +146,23 @@ def alarms_of(latest: LatestState, targets: Iterable[str], now_ns: int) -> tuple
     def place(cell: int | None) -> tuple[int | None, int | None]:
         return (None, None) if cell is None or not 0 <= cell < latest.grid.cells else latest.grid.row_col(cell)
 
-    heard = {topic.name for topic in latest.hears}
+    received = {topic.name for topic in latest.hears}
     alarms = [
         Alarm(
-            plain(told.kind),
-            plain(told.about),
-            plain(told.text),
-            None if told.since_ns == _UNKNOWN_NS else seconds(told.since_ns),
-            seconds(told.over_ns),
-            told.cell,
-            told.target,
-            seconds(heard_ns),
+            plain(alarm.kind),
+            plain(alarm.about),
+            plain(alarm.text),
+            None if alarm.since_ns == _UNKNOWN_NS else seconds(alarm.since_ns),
+            seconds(alarm.over_ns),
+            alarm.cell,
+            alarm.target,
+            seconds(received_ns),
             began_ns,
-            *place(told.cell),
-            is_old=now_ns - heard_ns > _OLD_NS,
+            *place(alarm.cell),
+            is_old=now_ns - received_ns > _OLD_NS,
         )
-        for told, heard_ns in found
-        if kind_of(told.kind).opened_by <= heard
+        for alarm, received_ns in found
+        if kind_of(alarm.kind).opened_by <= received
     ]
     lasting = sorted((a for a in alarms if a.lasts), key=lambda a: (not a.serious, a.since_s or 0.0, a.about))
     over = sorted((a for a in alarms if not a.lasts), key=lambda a: (-(a.over_s or 0.0), a.kind, a.about))
@@ -196,17 +196,17 @@ def _missing(latest: LatestState, targets: list[str], now_ns: int) -> Iterator[W
         leads = next((ranked for each, ranked in latest.up() if (each, job_of(ranked)) == (role, job_of(id))), None)
         instead = f"; {role}-{leads} does its work" if leads is not None and role != "agent" else ""
         state = "is gone" if latest.knows(role, id) else "has not come up yet"
-        yield _of_process("down", role, id, f"{state}{instead}", _said_ns(latest, role, id, _UNKNOWN_NS))
+        yield _of_process("down", role, id, f"{state}{instead}", _counted_ns(latest, role, id, _UNKNOWN_NS))
 
 
 def _silent(latest: LatestState, now_ns: int) -> Iterator[WireAlarm]:
-    for role, id, heard_ns in latest.silent(now_ns - SILENT_NS):
-        yield _of_process("silent", role, id, "is alive, but silent", _said_ns(latest, role, id, heard_ns))
+    for role, id, received_ns in latest.silent(now_ns - SILENT_NS):
+        yield _of_process("silent", role, id, "is alive, but silent", _counted_ns(latest, role, id, received_ns))
     for (role, id), (began_ns, over_ns) in sorted(latest.silences.items()):
         yield _of_process("silent", role, id, "was silent", began_ns, over_ns)
 
 
-def _said_ns(latest: LatestState, role: str, id: str, otherwise_ns: int) -> int:
+def _counted_ns(latest: LatestState, role: str, id: str, otherwise_ns: int) -> int:
     """Time when a process has said last what it counts."""
     stats = latest.newest_stats(role, id)
     return otherwise_ns if stats is None else stats.stamp_ns
@@ -222,16 +222,16 @@ def _of_process(kind: str, role: str, id: str, what: str, since_ns: int, over_ns
 def _lost(latest: LatestState, targets: list[str], now_ns: int) -> Iterator[tuple[WireAlarm, int]]:
     poses = latest.poses
     for id in sorted(latest.lost(now_ns).intersection(targets)):
-        status, pose = latest.told_by_planner(id), poses.get(id)
-        since_ns, cell, heard_ns = _UNKNOWN_NS, None if pose is None else pose.cell, now_ns
+        status, pose = latest.planner_status(id), poses.get(id)
+        since_ns, cell, received_ns = _UNKNOWN_NS, None if pose is None else pose.cell, now_ns
         if status is not None and status.pose_age_s is not None:
             # When the planner heard the last pose: the same whenever it is asked.
             since_ns, cell = status.stamp_ns - int(status.pose_age_s * NS_PER_S), status.target_cell
-            heard_ns = status.stamp_ns
+            received_ns = status.stamp_ns
         elif pose is not None:
             since_ns = pose.stamp_ns
         text = f"no tracker publishes {id}; routes lead to its last place"
         yield (
             WireAlarm(kind="target-lost", about=id, text=text, since_ns=since_ns, cell=cell, target=id),
-            heard_ns,
+            received_ns,
         )

@@ -91,13 +91,13 @@ def run_of_most(found: Iterable[RunInfo]) -> tuple[str, str]:
 
 def plan_of_members(members: Iterable[RunInfo]) -> RunPlan:
     """Returns the plan from the replies of the run's processes: the same as from its scenario."""
-    told = [info for info in members if info.run_id]
+    infos = [info for info in members if info.run_id]
     crew = dict.fromkeys(
-        (role, id) for info in told for role, _, id in (name.partition("-") for name in info.crew) if id
+        (role, id) for info in infos for role, _, id in (name.partition("-") for name in info.crew) if id
     )
     targets = tuple(id for role, id in crew if role == "planner" and not split_rank(id)[1])
-    began = [info.started_ns for info in told if info.started_ns > 0]
-    vehicles = max((info.vehicles for info in told), default=0)
+    began = [info.started_ns for info in infos if info.started_ns > 0]
+    vehicles = max((info.vehicles for info in infos), default=0)
     return RunPlan(targets, tuple(crew), vehicles, min(began, default=None))
 
 
@@ -226,20 +226,20 @@ class LatestState(Counts):
         self._started: dict[tuple[str, str], set[int]] = {}
         """(role, id) -> incarnations of the processes that the observer itself has started: the newest, and the one
         whose token was up then."""
-        self._told_ns: dict[tuple[str, str], int] = {}
+        self._seen_ns: dict[tuple[str, str], int] = {}
         """(role, id) -> time of the last counts or of the newest token, of a process that is or was alive; one that
         has ended is kept if it published counts, or if the observer started it."""
-        self._fleet_told_ns: dict[str, int] = {}
+        self._fleet_ns: dict[str, int] = {}
         """Agent -> time of its last message about vehicles."""
 
-    def heard(self, message: Message, now_ns: int) -> Message | None:
+    def on_message(self, message: Message, now_ns: int) -> Message | None:
         """Takes in a message; returns it, a pose with its cell, and None for a pose that does not count."""
         self.touch(now_ns)
         match message:
             case Stats():
                 self.count(message)
-                if (key := (message.role, message.id)) in self._told_ns:
-                    self._told_ns[key] = now_ns
+                if (key := (message.role, message.id)) in self._seen_ns:
+                    self._seen_ns[key] = now_ns
             case PlannerStatus():
                 # Only the planner that leads tells one, and a standby that takes over may be the older process.
                 _remember(self.status, message.target, message)
@@ -257,7 +257,7 @@ class LatestState(Counts):
                     _remember(self._fleets, at, message)
                     self._vehicles = None
                 if message.ids:
-                    _remember(self._fleet_told_ns, agent_of(message.ids[0]), now_ns)
+                    _remember(self._fleet_ns, agent_of(message.ids[0]), now_ns)
             case Obstacle():
                 _remember(self._obstacles, message.id, (message, now_ns))
             case TargetPose():
@@ -290,10 +290,10 @@ class LatestState(Counts):
         if not up:
             self._alive.gone(peer)
             if not self._alive.is_alive(*key) and key not in self._newest and key not in self._started:
-                self._told_ns.pop(key, None)  # of a stranger, whose names must not fill the place of others
+                self._seen_ns.pop(key, None)  # of a stranger, whose names must not fill the place of others
         elif peer.incarnation in self._started.get(key, (peer.incarnation,)):
             self._alive.appeared(peer)
-            _remember(self._told_ns, key, now_ns)
+            _remember(self._seen_ns, key, now_ns)
 
     def touch(self, now_ns: int) -> None:
         """Notes the time of a message of the run, or of its end."""
@@ -317,13 +317,13 @@ class LatestState(Counts):
 
     def was_up(self, role: str, id: str) -> bool:
         """Returns True if the process is or was alive; one that has ended is forgotten if it published nothing."""
-        return (role, id) in self._told_ns
+        return (role, id) in self._seen_ns
 
     def knows(self, role: str, id: str) -> bool:
         """Returns True if the process has ever been seen alive, or its counts are known."""
         return self.was_up(role, id) or (role, id) in self._newest
 
-    def told_by_planner(self, target: str) -> PlannerStatus | None:
+    def planner_status(self, target: str) -> PlannerStatus | None:
         """Returns the state of the leading planner; None if there is none, or it has ended."""
         ids = [ranked_id(target, rank) for rank in range(HIGHEST_RANK + 1)]
         gone = any(self.knows("planner", id) for id in ids) and not any(self.is_well("planner", id) for id in ids)
@@ -343,16 +343,16 @@ class LatestState(Counts):
         of another name, as when it was started by hand."""
         if self.is_well(role, id) or role not in ("keeper", "targets") or split_rank(id)[1]:
             return self.is_well(role, id)
-        known = {each for each_role, each in (*self._told_ns, *self._newest) if each_role == role}
+        known = {each for each_role, each in (*self._seen_ns, *self._newest) if each_role == role}
         return any(self.is_well(role, each) for each in known if not split_rank(each)[1])
 
     def silent(self, before_ns: int) -> list[tuple[str, str, int]]:
         """Returns (role, id, time of the last counts) of each process that is alive and published counts, but none
         after `before_ns`."""
         return [
-            (*key, told_ns)
-            for key, told_ns in sorted(self._told_ns.items())
-            if told_ns < before_ns and self._alive.is_alive(*key) and key in self._newest
+            (*key, seen_ns)
+            for key, seen_ns in sorted(self._seen_ns.items())
+            if seen_ns < before_ns and self._alive.is_alive(*key) and key in self._newest
         ]
 
     def now_of(self, name: str) -> float | None:
@@ -381,8 +381,8 @@ class LatestState(Counts):
     def lost(self, now_ns: int) -> set[str]:
         """Returns the targets that no tracker publishes now; those without a tracker according to their
         planners."""
-        told = {id for id, status in self.status.items() if status.tracker_lost and self._trackings.of(id) is None}
-        return self._trackings.lost(now_ns) | told
+        lost = {id for id, status in self.status.items() if status.tracker_lost and self._trackings.of(id) is None}
+        return self._trackings.lost(now_ns) | lost
 
     def pose_age_s(self, target: str, now_ns: int) -> float | None:
         """Time since the target's last pose; None before the first."""
@@ -423,20 +423,20 @@ class LatestState(Counts):
             return True
         if self.knows("agent", agent):
             return of_crew and self.is_well("agent", agent)
-        return now_ns - self._fleet_told_ns.get(agent, 0) <= _VEHICLES_LAST_NS  # it raises no token
+        return now_ns - self._fleet_ns.get(agent, 0) <= _VEHICLES_LAST_NS  # it raises no token
 
-    def tells_of_vehicles(self, agent: str) -> bool:
+    def knows_vehicles(self, agent: str) -> bool:
         """Returns True if the agent has published its vehicles, and the places of those which were sent there:
         they have no target, and are not idle."""
         fleets = [fleet for fleet in self._fleets.values() if fleet.ids and agent_of(fleet.ids[0]) == agent]
         rows = (row for fleet in fleets for row in zip(fleet.ids, fleet.targets, fleet.states, strict=True))
         sent = (id for id, target, state in rows if target == NO_TARGET and state != VehicleState.IDLE)
-        return agent in self._fleet_told_ns and all(id in self._goals for id in sent)
+        return agent in self._fleet_ns and all(id in self._goals for id in sent)
 
     def external(self, now_ns: int) -> dict[str, Obstacle]:
         """Returns the external vehicles and other obstacles whose lease has not ended, in order of id."""
         reports = sorted(self._obstacles.items())
-        return {id: each for id, (each, heard_ns) in reports if now_ns - heard_ns < each.lease_s * NS_PER_S}
+        return {id: each for id, (each, received_ns) in reports if now_ns - received_ns < each.lease_s * NS_PER_S}
 
     def external_seen(self) -> list[str]:
         """Returns the ids of all external vehicles and other obstacles that ever told their places, in order."""

@@ -90,7 +90,7 @@ _MOST_CELLS = 1 << 18
 """Cells of the ground that a page shows at most."""
 
 
-def said_length(length_m: float) -> str:
+def format_length(length_m: float) -> str:
     """Returns a length in words, in m or km."""
     return f"{length_m / 1000:g} km" if length_m >= 1000 else f"{length_m:g} m"
 

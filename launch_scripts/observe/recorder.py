@@ -76,14 +76,14 @@ class Thinned(Generic[T]):
 class Sample(NamedTuple):
     """The run at one instant.
 
-    shown       name of a series of the report -> its value; None until it is published
+    values      name of a series of the report -> its value; None until it is published
     gap_excess  int64 (n, 2): bucket and count of the histogram of certified gaps - 1 of all routes that were begun
                 until then; packed, as hundreds of them are kept
     at_rest_s   (waiting, standing), seconds of all vehicles together until `driven_s`, as `Driven` counts them
     driven_s    UNIX time of the last count of these; 0 before
     """
 
-    shown: dict[str, float | None]
+    values: dict[str, float | None]
     gap_excess: NDArray[np.int64]
     at_rest_s: tuple[float, float]
     driven_s: float
@@ -106,7 +106,7 @@ def rows_over_time(samples: Sequence[Sample]) -> Iterator[dict[str, float | None
             waiting_s, standing_s = np.subtract(sample.at_rest_s, before.at_rest_s).clip(0.0) / passed_s
             at_once = float(waiting_s), float(standing_s)
         yield {
-            **sample.shown,
+            **sample.values,
             **{f"certified_gap_{name}": gap for name, gap in of_excess(begun).items()},
             "routes_begun": begun.count,
             "waiting_at_once": at_once[0],
@@ -210,7 +210,7 @@ def _by_vehicle(
     latest: LatestState, driven: Driven, scenario: Scenario, classes: Mapping[str, str]
 ) -> dict[str, Any]:
     planned = {plan.id: plan.group.name for plan in plan_agents(scenario)}
-    captures, gaps, told = latest.counts_by(CAPTURES_BY), gaps_of(latest), latest.classes()
+    captures, gaps, reported = latest.counts_by(CAPTURES_BY), gaps_of(latest), latest.classes()
     totals = dict(zip(driven.ids, driven.totals.T.tolist(), strict=True))
     vehicles = latest.vehicles()
     states = dict(zip(vehicles.ids, vehicles.states.tolist(), strict=True))
@@ -220,7 +220,7 @@ def _by_vehicle(
         group = planned.get(agent_of(id)) or driven.groups.get(id, "")
         rows[id] = {
             "group": group,
-            "class": told.get(id) or classes.get(group, GROUND),
+            "class": reported.get(id) or classes.get(group, GROUND),
             "captures": captures.get(id, 0),
             **dict(zip(_DRIVEN, totals.get(id, (0.0, 0.0, 0.0)), strict=True)),
             **_gap_fields(gaps.get(id)),
@@ -311,9 +311,9 @@ class Recorder:
         self.routed: set[str] = set()
         self._gap_max: float | None = None
 
-    def heard(self, message: Message, now_ns: int) -> None:
+    def on_message(self, message: Message, now_ns: int) -> None:
         """Records one message."""
-        if self.observed.heard(message, now_ns) is None:
+        if self.observed.on_message(message, now_ns) is None:
             return
         match message:
             case Followed():
@@ -379,7 +379,7 @@ class Recorder:
         self._sample_due_ns = now_ns + _SAMPLE_NS
         state = self.summary(now_ns)
         _, waiting_s, standing_s = self.driven.totals.sum(axis=1).tolist()
-        shown = {
+        values = {
             "t_s": state.elapsed_s,
             "captures": state.captures,
             "marks": state.marks,
@@ -387,9 +387,9 @@ class Recorder:
             **state.states,
             "growth_ms_mean": _mean(line.growth_ms for line in state.targets),
         }
-        begun = sorted(self.observed.histogram("followed_gap_excess").buckets.items())
+        gaps = sorted(self.observed.histogram("followed_gap_excess").buckets.items())
         driven_s = (self.driven.at_ns or 0) / NS_PER_S
-        self.samples.add(Sample(shown, np.array(begun, np.int64).reshape(-1, 2), (waiting_s, standing_s), driven_s))
+        self.samples.add(Sample(values, np.array(gaps, np.int64).reshape(-1, 2), (waiting_s, standing_s), driven_s))
 
     def report(
         self,
@@ -431,7 +431,7 @@ class Recorder:
             **{name: observed.total(name) for name in _TOTALS},
             "gap": gap if self._gap_max is None else {**gap, "max": self._gap_max},
             **{name: quantiles(observed.histogram(name)) for name in TIMINGS},
-            "messages_per_s": _mean(sample.shown["messages_per_s"] for sample in self.samples.all()),
+            "messages_per_s": _mean(sample.values["messages_per_s"] for sample in self.samples.all()),
             "by_target": _by_target(observed, self.scenario),
             "by_group": _by_group(observed, by_vehicle, classes),
             "by_vehicle": by_vehicle,
@@ -452,7 +452,7 @@ class Recorder:
             for name in DISTRIBUTIONS
         }
 
-    def notes_told(self) -> list[dict[str, Any]]:
+    def note_rows(self) -> list[dict[str, Any]]:
         """The newest events for people, in order of time."""
         return [
             {"t_s": round(time_s, 3), "from": f"{note.role} {note.id}", "kind": note.kind, "text": note.text}

@@ -228,14 +228,14 @@ def begin_run(
         SCENARIO_FILE: head + scenario_text(scenario, Path.cwd()),
         RUN_FILE: json.dumps(facts, indent=1) + "\n",
     }
-    said = []
+    warnings = []
     for name, text in texts.items():
         try:
             write_file(folder / name, text.encode())
         except StoreError as error:
-            said.append(str(error))
-    said += filter(None, (point_last(folder), register(folder, is_whole=simulated)))
-    return said
+            warnings.append(str(error))
+    warnings += filter(None, (point_last(folder), register(folder, is_whole=simulated)))
+    return warnings
 
 
 def ended(folder: Path) -> dict[str, Any]:
@@ -323,16 +323,16 @@ def version_of(package: str) -> str | None:
     """The version of an installed package, with the commit if it is ours in a checkout; None where it is not
     installed."""
     try:
-        said = importlib.metadata.version(package)
+        version = importlib.metadata.version(package)
     except importlib.metadata.PackageNotFoundError:
         return None
     root = Path(__file__).parents[2]
     if package != OURS or not (root / ".git").exists() or not shutil.which("git"):
-        return said
+        return version
     # The editable installation of a checkout outlives the commit that it was made from (hatch_build.py).
     asked = ["git", "-C", str(root), "rev-parse", "--short=12", "HEAD"]
     commit = subprocess.run(asked, capture_output=True, text=True, check=False).stdout.strip()
-    return "+g".join(filter(None, (said.partition("+")[0], commit)))
+    return "+g".join(filter(None, (version.partition("+")[0], commit)))
 
 
 def _now() -> str:
@@ -363,7 +363,7 @@ class DiskWatch:
     def __init__(self, folder: Path) -> None:
         self._folder = folder
         self._due_s = 0.0
-        self._said_s: float | None = None
+        self._warned_s: float | None = None
         """Time when it was last said that there is no space; None while there is."""
 
     def check_room(self, now_s: float) -> str | None:
@@ -374,11 +374,11 @@ class DiskWatch:
         try:
             check_writable(self._folder)
         except StoreError as error:
-            if self._said_s is not None and now_s - self._said_s < SAY_EVERY_S:
+            if self._warned_s is not None and now_s - self._warned_s < SAY_EVERY_S:
                 return None
-            self._said_s = now_s
+            self._warned_s = now_s
             return f"{error}; all goes on but logs and recording"
-        if self._said_s is None:
+        if self._warned_s is None:
             return None
-        self._said_s = None
+        self._warned_s = None
         return f"{self._folder} can be written again"

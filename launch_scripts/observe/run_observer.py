@@ -69,7 +69,7 @@ _LEARNED_TIMEOUT_S = 2.0
 class Known(Protocol):
     """Receiver of an observer's messages, such as `LatestState` or `Recorder`."""
 
-    def heard(self, message: Message, now_ns: int) -> object:
+    def on_message(self, message: Message, now_ns: int) -> object:
         """Takes in a message."""
 
     def alive(self, peer: Peer, up: bool, now_ns: int) -> None:
@@ -142,7 +142,7 @@ class RunObserver:
             case _ if self._known is None:
                 pass
             case Heard(message=message) | Replied(tag="observer-gone", message=message):
-                self._known.heard(message, now_ns)
+                self._known.on_message(message, now_ns)
             case Appeared(peer):
                 self._known.alive(peer, True, now_ns)
             case Disappeared(peer):
@@ -234,7 +234,7 @@ class OutsideObserver(RunObserver):
         return self.answered and all(
             latest is not None
             and latest.newest_stats(info.role, info.id) is not None
-            and (info.role != "agent" or latest.tells_of_vehicles(info.id))
+            and (info.role != "agent" or latest.knows_vehicles(info.id))
             for info in self.answers.values()
         )
 
@@ -295,7 +295,7 @@ def ask_learned(bus: Bus, where: object) -> list[MarkSet]:
     asked = MarksRequest(tiles=[beyond_tile(latest.grid)])
     replies, failure = replies_to(bus, wire_topics.MARKS, asked, _LEARNED_TIMEOUT_S)
     for word in replies:
-        latest.heard(word, 0)
+        latest.on_message(word, 0)
     if not (found := latest.learned_words()) and failure is not None:
         raise BusError(f"no process {where} states what was learned: {failure}")
     return found

@@ -19,7 +19,7 @@ import numpy as np
 from launch_scripts.observe.alarms import Alarm, alarms_of, kind_of, starts
 from launch_scripts.observe.latest_messages import LatestState, VehicleColumns
 from launch_scripts.observe.summed_counts import CertifiedGap, certified_gap, gap_text, gaps_to, percent
-from launch_scripts.plain_text import first_of, number_of, plain, said_duration
+from launch_scripts.plain_text import first_of, format_duration, number_of, plain
 from swarm.clock import NS_PER_S
 from swarm.config.explain import hints_of
 from swarm.config.vehicle_classes import GROUND
@@ -41,7 +41,7 @@ def count(value: float | None) -> str:
 
 def seconds(value: float | None) -> str:
     """Returns text such as 34 s, 19 min."""
-    return NONE if value is None else said_duration(value)
+    return NONE if value is None else format_duration(value)
 
 
 def distance(value_m: float) -> str:
@@ -96,14 +96,14 @@ class Fact:
     is_total: bool = False
     name: str = ""
 
-    def shown(self, state: RunState | TargetLine) -> str:
+    def format(self, state: RunState | TargetLine) -> str:
         """The fact in words, as people see it."""
         value = getattr(state, self.name)
         return NONE if value is None else self.text(value)
 
     def labelled(self, state: RunState) -> str:
         """The same after its label."""
-        return f"{self.label} {self.shown(state)}"
+        return f"{self.label} {self.format(state)}"
 
 
 def total(label: str) -> Fact:
@@ -151,7 +151,7 @@ class TargetLine:
         """The id, and exceptional states of its tracker and its planner."""
         unusual = []
         if self.lost:
-            unusual.append("lost" if self.pose_age_s is None else f"lost for {said_duration(self.pose_age_s)}")
+            unusual.append("lost" if self.pose_age_s is None else f"lost for {format_duration(self.pose_age_s)}")
         if not self.planner_up:
             unusual.append("planner starting" if self.starting else "planner down")
         elif self.rank:
@@ -288,7 +288,7 @@ def _lines(
     captures, gaps = latest.counts_by(CAPTURES_OF), gaps_to(latest)
     lines = []
     for id in targets:
-        pose, status = poses.get(id), latest.told_by_planner(id)
+        pose, status = poses.get(id), latest.planner_status(id)
         nearest_m = None
         if pose is not None and len(vehicles):
             east_m, south_m = latest.place_m(pose)
@@ -318,18 +318,18 @@ def _lines(
 
 def _learned(latest: LatestState) -> dict[str, float]:
     """Learned factors, from the planner that has the most: planners of other groups may have received fewer."""
-    told = [
+    factors = [
         {name.removeprefix(LEARNED): value for name, value in stats.gauges.items() if name.startswith(LEARNED)}
         for (role, _), stats in latest.newest().items()
         if role == "planner"
     ]
-    return dict(sorted(max(told, key=len, default={}).items()))
+    return dict(sorted(max(factors, key=len, default={}).items()))
 
 
 def table(state: RunState, *, always: bool = True) -> tuple[list[str], list[list[str]]]:
     """The labels of the columns that every table of targets has, or of the target and the others; and the rows."""
     columns = [column for column in TARGET_FACTS if column.always == always or column is TARGET_FACTS[0]]
-    rows = [[column.shown(line) for column in columns] for line in state.targets]
+    rows = [[column.format(line) for column in columns] for line in state.targets]
     return [column.label for column in columns], rows
 
 
@@ -348,7 +348,7 @@ MUST_BE_ZERO = ("collisions", "lethal_entries", "driven_into", "hit_by_obstacles
 
 def measured(names: Iterable[str], state: RunState) -> list[str]:
     """Those of some facts whose value is known, after their labels."""
-    return [fact(name).labelled(state) for name in names if fact(name).shown(state) != NONE]
+    return [fact(name).labelled(state) for name in names if fact(name).format(state) != NONE]
 
 
 def lines(state: RunState) -> list[str]:
@@ -443,7 +443,7 @@ def verdict(report: Mapping[str, Any], failures: Sequence[str] = ()) -> str:
     reached += [] if collisions is None else [number_of(collisions, "collision")]
     forbidden = [f"{fact(name).label} {count(report[name])}" for name in MUST_BE_ZERO[:-1] if report.get(name)]
     serious = [
-        alarm["text"] + (f" for {said_duration(alarm['over_s'] - alarm['since_s'])}" if alarm["over_s"] else "")
+        alarm["text"] + (f" for {format_duration(alarm['over_s'] - alarm['since_s'])}" if alarm["over_s"] else "")
         for alarm in report.get("alarms") or []
         if kind_of(alarm["kind"]).serious and (alarm["over_s"] is None or alarm["kind"] == "silent")
     ]

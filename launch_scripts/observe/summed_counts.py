@@ -27,8 +27,8 @@ Number = TypeVar("Number", int, float)
 
 def sum_of(values: Iterable[Number | None]) -> Number | None:
     """Returns the sum of known values; None if there are none."""
-    told = [value for value in values if value is not None]
-    return sum(told) if told else None
+    known = [value for value in values if value is not None]
+    return sum(known) if known else None
 
 
 _LEAST_NS = NS_PER_S // 2

@@ -37,12 +37,12 @@ def settings_that_differ(runs: Sequence[LeftRun]) -> list[Row]:
 
 def circumstances_that_differ(runs: Sequence[LeftRun]) -> list[Row]:
     """Versions, machines, terrains, and kinds of run that are not the same: what makes figures incomparable."""
-    told = []
+    flat = []
     for report in (run.report for run in runs):
         made, digest = _table(report.get("made")), _table(report.get("terrain")).get("digest")
         of = [each for name in ("versions", "machine") for each in _flat(made.get(name) or {}, name)]
-        told.append({**dict(of), "terrain": digest, "simulated": "simulated" in report})
-    return _that_differ(told)
+        flat.append({**dict(of), "terrain": digest, "simulated": "simulated" in report})
+    return _that_differ(flat)
 
 
 def _that_differ(runs: Sequence[Mapping[str, Any] | None]) -> list[Row]:
@@ -57,16 +57,16 @@ def _that_differ(runs: Sequence[Mapping[str, Any] | None]) -> list[Row]:
 
 def figures(runs: Sequence[LeftRun]) -> list[Row]:
     """The figures of all runs, by what people call them."""
-    told: list[dict[str, Any]] = []
+    flat: list[dict[str, Any]] = []
     for report in (run.report for run in runs):
         named = _flat({label: report.get(name) for name, label in REPORTED.items()}, "")
         groups, targets = _table(report.get("by_group")), _table(report.get("by_target"))
-        told.append(
+        flat.append(
             {key.replace(".", ", "): value for key, value in named}
             | {label: _sum(groups, name) for name, label in SUMMED.items()}
             | {f"captures of {id}": _table(row).get("captures") for id, row in targets.items()}
         )
-    rows = [(key, [each.get(key) for each in told]) for key in dict.fromkeys(key for each in told for key in each)]
+    rows = [(key, [each.get(key) for each in flat]) for key in dict.fromkeys(key for each in flat for key in each)]
     return [row for row in rows if any(value is not None for value in row[1])]
 
 

@@ -264,10 +264,10 @@ def instants_of(changes: Iterable[int], first_ns: int, last_ns: int, most: int) 
     """Time when to tell what changes at these times: at or soon after each change, at most once a second, at most
     `most` times, and never after the end."""
     period_ns = max(NS_PER_S, -(-(last_ns - first_ns) // max(most - 1, 1)))
-    told_ns = {
+    times_ns = {
         first_ns + -(-(min(max(each, first_ns), last_ns) - first_ns) // period_ns) * period_ns for each in changes
     }
-    return sorted({min(each, last_ns) for each in told_ns})
+    return sorted({min(each, last_ns) for each in times_ns})
 
 
 # --- what a run said in words, as lines of a log ------------------------------------------------------------------
@@ -319,9 +319,9 @@ def lines_of(report: Mapping[str, Any], path: Path, began_ns: int, captures: lis
         if each.time_ns[0] < first_ns - NS_PER_S:
             lines.append(Line(int(each.time_ns[0]), Severity.INFO, "targets", f"{each.id} was captured"))
     for alarm in words.alarms or []:
-        said, severity = f"{alarm.label}: {alarm.text}", Severity.ERROR if alarm.serious else Severity.WARN
+        text, severity = f"{alarm.label}: {alarm.text}", Severity.ERROR if alarm.serious else Severity.WARN
         if alarm.since_s is not None:
-            lines.append(Line(at(alarm.since_s), severity, alarm.about, said))
+            lines.append(Line(at(alarm.since_s), severity, alarm.about, text))
         if alarm.over_s is not None and alarm.over_s != alarm.since_s:
             over = f"{alarm.label} is over: {alarm.text}"
             lines.append(Line(at(alarm.over_s), Severity.INFO, alarm.about, over))

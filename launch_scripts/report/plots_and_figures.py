@@ -93,12 +93,12 @@ def draw_plot(axes: Axes, plot: Plot, report: Report, *, titled: bool = True) ->
 
 def _states(axes: Axes, plot: Plot, report: Report) -> bool:
     series = report["series"]
-    shown = [name for name in plot.lines if any(series.get(name) or ())]
-    if not shown:  # stopped before any vehicle had published its position
+    measured = [name for name in plot.lines if any(series.get(name) or ())]
+    if not measured:  # stopped before any vehicle had published its position
         return False
-    labels, colours = zip(*(plot.lines[name] for name in shown), strict=True)
-    axes.stackplot(series["t_s"], *(series[name] for name in shown), labels=labels, colors=colours, linewidth=0)
-    axes.set_ylim(0, max(np.sum([series[name] for name in shown], axis=0).max(), plot.least))
+    labels, colours = zip(*(plot.lines[name] for name in measured), strict=True)
+    axes.stackplot(series["t_s"], *(series[name] for name in measured), labels=labels, colors=colours, linewidth=0)
+    axes.set_ylim(0, max(np.sum([series[name] for name in measured], axis=0).max(), plot.least))
     return True
 
 
@@ -111,10 +111,10 @@ def _courses(axes: Axes, plot: Plot, report: Report) -> bool:
         known = np.array([(time, value) for time, value in both if value is not None], np.float64)
         if not len(known):
             continue
-        times, shown, drawn = known[:, 0], plot.of(known[:, 1]), True
-        axes.plot(times, shown, "--" if number else "-", color=colour, linewidth=1.7, label=label)
-        axes.fill_between(times, shown, color=colour, alpha=0.0 if number else 0.25, linewidth=0)
-        most = max(most, 1.1 * float(shown.max()))
+        times, plotted, drawn = known[:, 0], plot.of(known[:, 1]), True
+        axes.plot(times, plotted, "--" if number else "-", color=colour, linewidth=1.7, label=label)
+        axes.fill_between(times, plotted, color=colour, alpha=0.0 if number else 0.25, linewidth=0)
+        most = max(most, 1.1 * float(plotted.max()))
     axes.set_ylim(0, most)
     return drawn
 
@@ -199,13 +199,13 @@ def halo() -> list[Any]:
 
 
 @contextlib.contextmanager
-def saved(path: Path, size_in: tuple[float, float], dpi: int = 120, **look: Any) -> Iterator[Figure]:
+def saved(path: Path, size_in: tuple[float, float], dpi: int = 120, **options: Any) -> Iterator[Figure]:
     """A figure in the style of all pictures, which is written at the end. Raises StoreError if it cannot be.
 
-    look  as `Figure` takes it
+    options  as `Figure` takes them
     """
     with mpl.rc_context(fname=STYLE):
-        figure = Figure(figsize=size_in, dpi=dpi, facecolor="white", **look)
+        figure = Figure(figsize=size_in, dpi=dpi, facecolor="white", **options)
         FigureCanvasAgg(figure)
         yield figure
         try:
@@ -229,7 +229,7 @@ class Card(NamedTuple):
 
 def cards(report: Mapping[str, Any]) -> list[Card]:
     """The main figures of a run, for the picture and the page."""
-    said = meanings(RunState)
+    texts = meanings(RunState)
     gap = report["certified_gap"]
     unproven = gap.get("unproven") or 0
     not_counted = f" {count(unproven)} had none and are not counted." if unproven else ""
@@ -245,9 +245,9 @@ def cards(report: Mapping[str, Any]) -> list[Card]:
     )
 
     def of_facts(*names: str, tone: Callable[[Any], str] = lambda value: "") -> list[Card]:
-        told = [(fact(name), report[name], said[name]) for name in names]
+        rows = [(fact(name), report[name], texts[name]) for name in names]
         return [
-            Card(of.label, of.text(value), f"{text[0].upper()}{text[1:]}.", tone(value)) for of, value, text in told
+            Card(of.label, of.text(value), f"{text[0].upper()}{text[1:]}.", tone(value)) for of, value, text in rows
         ]
 
     return [

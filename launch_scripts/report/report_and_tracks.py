@@ -62,7 +62,7 @@ def with_series(numbers: Mapping[str, Any], recorder: Recorder, terrain: Terrain
         "learned_kinds": [each._asdict() for each in learned_kinds(recorder.observed.learned_words())],
         "series": recorder.series(),
         "distributions": recorder.distributions(),
-        "notes": recorder.notes_told(),
+        "notes": recorder.note_rows(),
     }
 
 
@@ -397,11 +397,11 @@ def _routes(columns: Mapping[str, NDArray[Any]], grid: GridSpec) -> list[GivenRo
     """The routes of the file, but for those that no agent of ours tells: they leave the grid."""
     names = ("vehicle", "target", "time_ns", "start", "cost_s", "bound_s")
     rows = zip(*(columns[f"routes_{name}"].tolist() for name in names), strict=True)
-    ways, legs = (
+    directions, legs = (
         _split("routes_directions", columns, "routes_steps"), _split("routes_legs", columns, "routes_many_legs")
     )  # fmt: skip
     routes = []
-    for (vehicle, target, time_ns, start, cost_s, bound_s), way, own in zip(rows, ways, legs, strict=False):
+    for (vehicle, target, time_ns, start, cost_s, bound_s), way, own in zip(rows, directions, legs, strict=False):
         try:
             cells = np.array(walk(grid, start, way.tobytes()), np.int64)
         except ValueError:

@@ -47,8 +47,8 @@ def _moved(lines: Layer, tracks: Sequence[tuple[Track, dict[str, gis.Value]]]) -
             continue
         length_m = _length_m(track.xy_m)
         begins, ends = (gis.moment(track.time_ns[n]) for n in (0, -1))
-        told: tuple[gis.Value, ...] = (begins, ends, len(track.time_ns), length_m)
-        values = {**whose, **dict(zip(gis.TIMED, told, strict=True))}
+        timed: tuple[gis.Value, ...] = (begins, ends, len(track.time_ns), length_m)
+        values = {**whose, **dict(zip(gis.TIMED, timed, strict=True))}
         if length_m == 0:
             points.features.append(Feature([track.xy_m[:1]], values))
         else:
@@ -80,8 +80,8 @@ def _routes(tracks: RunTracks, groups: Groups) -> list[Layer]:
         xy_m = middles_of(tracks.grid, gis.turns_of(route.cells, tracks.grid)).T
         if (length_m := _length_m(xy_m)) > 0:
             at, gap = gis.moment(np.int64(route.time_ns)), route.gap if math.isfinite(route.gap) else None
-            told = (route.vehicle, route.target, at, route.cost_s, gap, length_m)
-            layer.features.append(Feature([xy_m], dict(zip(layer.fields, told, strict=True))))
+            row = (route.vehicle, route.target, at, route.cost_s, gap, length_m)
+            layer.features.append(Feature([xy_m], dict(zip(layer.fields, row, strict=True))))
     return [layer]
 
 
@@ -114,8 +114,8 @@ def mark_layer(grid: GridSpec, kinds: NDArray[np.uint8], paces: NDArray[np.float
     for code, rings in gis.areas_of(codes, codes > 0, grid):
         area_m2 = shapely.Polygon(rings[0], rings[1:]).area
         kind, pace = ("lethal", None) if code == 1 else ("pace", float(f"{rounded[code - 2]:.4g}"))
-        told = (kind, pace, round(area_m2 / grid.resolution_m**2), round(area_m2, 3))
-        layer.features.append(Feature(rings, dict(zip(layer.fields, told, strict=True))))
+        row = (kind, pace, round(area_m2 / grid.resolution_m**2), round(area_m2, 3))
+        layer.features.append(Feature(rings, dict(zip(layer.fields, row, strict=True))))
     return layer
 
 

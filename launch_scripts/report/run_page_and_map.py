@@ -32,7 +32,7 @@ from scipy.ndimage import binary_erosion
 
 from launch_scripts.observe import palette
 from launch_scripts.observe.alarms import Alarm
-from launch_scripts.observe.palette import colours_of_groups, rgb, round_length, said_length
+from launch_scripts.observe.palette import colours_of_groups, format_length, rgb, round_length
 from launch_scripts.observe.run_folders import REPORT_FILE, SCENARIO_FILE, read_report
 from launch_scripts.observe.run_state import WELL, count, grouped, left_behind
 from launch_scripts.observe.summed_counts import percent
@@ -180,9 +180,9 @@ def _draw_scale(axes: Axes, width_km: float, height_km: float) -> None:
     """A bar of a round length, about a fifth of the width, in the lower left corner; an arrow to the north."""
     length, x0, y0 = round_length(width_km / 5), 0.03 * width_km, 0.965 * height_km
     axes.plot([x0, x0 + length], [y0, y0], color=palette.INK, linewidth=3, path_effects=halo(), zorder=11)
-    look: dict[str, Any] = {"fontweight": "bold", "zorder": 11, "path_effects": halo()}
-    axes.annotate(said_length(length * 1000), (x0, y0), (0, 5), textcoords="offset points", fontsize=9.5, **look)
-    axes.text(0.968, 0.985, "↑\nN", transform=axes.transAxes, ha="center", va="top", fontsize=12, **look)
+    style: dict[str, Any] = {"fontweight": "bold", "zorder": 11, "path_effects": halo()}
+    axes.annotate(format_length(length * 1000), (x0, y0), (0, 5), textcoords="offset points", fontsize=9.5, **style)
+    axes.text(0.968, 0.985, "↑\nN", transform=axes.transAxes, ha="center", va="top", fontsize=12, **style)
 
 
 # --- the ground ---------------------------------------------------------------------------------------------------
@@ -390,8 +390,8 @@ def page_of(folder: Path, report: Mapping[str, Any]) -> str:
         where=f"{folder.resolve().parent.name}/{folder.resolve().name}",
         facts=headline(report, folder.resolve().name),
         cards=cards(report),
-        verdict=(said := str(report.get("verdict") or "")),
-        well=WELL in said,
+        verdict=(verdict := str(report.get("verdict") or "")),
+        well=WELL in verdict,
         alarms=_alarms(report),
         left_behind=left_behind(report),
         map=_map(folder, report),
@@ -411,24 +411,24 @@ def page_of(folder: Path, report: Mapping[str, Any]) -> str:
 
 def _alarms(report: Mapping[str, Any]) -> list[tuple[str, bool, list[str]]]:
     """Returns the alarms, the serious first: a line, whether it is serious, and the lines that it summarises."""
-    told = msgspec.convert(report.get("alarms") or [], list[Alarm])
+    alarms = msgspec.convert(report.get("alarms") or [], list[Alarm])
     return [
         (line, serious, parts)
         for serious in (True, False)
-        for line, parts in grouped(each for each in told if each.serious == serious)
+        for line, parts in grouped(each for each in alarms if each.serious == serious)
     ]
 
 
 def _table(section: str, heading: str, report: Mapping[str, Any]) -> dict[str, Any]:
     rows = {id: flat(id, row) for id, row in (report.get(section) or {}).items()}
     columns = list(dict.fromkeys(name for row in rows.values() for name in row))[1:]
-    shown = list(rows.items())[:_ROWS_SHOWN]
+    kept = list(rows.items())[:_ROWS_SHOWN]
     return {
         "section": section,
         "heading": heading,
         "columns": [name.replace("_", " ") for name in columns],
-        "rows": [(id, [_cell(name, row.get(name)) for name in columns]) for id, row in shown],
-        "left": len(rows) - len(shown),
+        "rows": [(id, [_cell(name, row.get(name)) for name in columns]) for id, row in kept],
+        "left": len(rows) - len(kept),
     }
 
 

@@ -107,8 +107,8 @@ class _Generation:
     ticked_ns: int | None = None
 
     def take(self, report: Obstacle, now_ns: int) -> None:
-        known, heard_ns = self.reports.get((report.id, report.incarnation), (None, 0))
-        if known is None or report.seq > known.seq or now_ns - heard_ns >= known.lease_s * NS_PER_S:
+        known, received_ns = self.reports.get((report.id, report.incarnation), (None, 0))
+        if known is None or report.seq > known.seq or now_ns - received_ns >= known.lease_s * NS_PER_S:
             self.reports[report.id, report.incarnation] = report, now_ns
 
 

@@ -427,8 +427,8 @@ def outcome_table(summary: Summary, name: str) -> str:
     rows = []
     for case in summary.cases:
         outcome = case.outcomes[name]
-        told = (*_cells(outcome.mean), *_cells(outcome.median), *_cells(outcome.difference, "+"))
-        rows.append((case.scenario, case.label, str(len(outcome.values)), *told))
+        figures = (*_cells(outcome.mean), *_cells(outcome.median), *_cells(outcome.difference, "+"))
+        rows.append((case.scenario, case.label, str(len(outcome.values)), *figures))
     headings = ("scenario", "case", "n", "mean", "95 %", "median", "95 %", "to the first case", "95 %")
     widths = [max(map(len, column)) for column in zip(headings, *rows, strict=True)]
     first, *rest = (f"| {' | '.join(map(str.ljust, row, widths))} |" for row in (headings, *rows))

@@ -8,7 +8,7 @@ from collections.abc import Callable, Sequence
 from functools import partial
 from typing import NamedTuple
 
-from launch_scripts.plain_text import said_duration
+from launch_scripts.plain_text import format_duration
 from launch_scripts.web import PROBED, READY, Page, Reply
 from swarm.clock import NS_PER_S
 from swarm.runtime.loop_health import Phase, Vitals
@@ -34,7 +34,7 @@ class Process(NamedTuple):
         if self.vitals is None:
             return "starts", None, ("its start",)
         if self.vitals.hangs(now_ns):
-            wrong = f"its loop hangs for {said_duration((now_ns - self.vitals.stamp_ns) / NS_PER_S)}"
+            wrong = f"its loop hangs for {format_duration((now_ns - self.vitals.stamp_ns) / NS_PER_S)}"
             return "hangs", wrong, (wrong,)
         return self.vitals.phase.name.lower(), None, self.vitals.lacks
 
@@ -46,7 +46,7 @@ def verdict(question: str, processes: Sequence[Process], now_ns: int) -> Reply:
     now_ns  on the monotonic clock of the machine
     """
     missing: list[str] = []
-    told: list[dict[str, object]] = []
+    rows: list[dict[str, object]] = []
     for each in processes:
         state, wrong, lacks = each.seen(now_ns)
         found = lacks if question == READY else () if wrong is None else (wrong,)
@@ -54,9 +54,9 @@ def verdict(question: str, processes: Sequence[Process], now_ns: int) -> Reply:
         row: dict[str, object] = {"name": each.name, "state": state, "lacks": lacks}
         if each.ended is None and each.vitals is not None and each.vitals.phase is Phase.RUNS:
             row["ticked_s_ago"] = round((now_ns - each.vitals.stamp_ns) / NS_PER_S, 3)
-        told.append(row)
+        rows.append(row)
     word = "ready" if question == READY else "healthy"
-    answer = {"status": f"not {word}" if missing else word, "missing": missing, "processes": told}
+    answer = {"status": f"not {word}" if missing else word, "missing": missing, "processes": rows}
     body = json.dumps(answer, indent=1).encode("ascii") + b"\n"
     return Reply(503 if missing else 200, "application/json", body)
 

@@ -31,20 +31,20 @@ _LONGEST = 300
 
 
 class Answer(NamedTuple):
-    """Reply to a probe. Nothing of `told` is to be trusted: it came from the network."""
+    """Reply to a probe. Nothing of `page` is to be trusted: it came from the network."""
 
     ok: bool
-    told: dict[str, Any]
+    page: dict[str, Any]
 
     def lines(self) -> list[str]:
         """For people."""
-        missing = self.told.get("missing")
-        lines = [self.told.get("status"), *(missing if isinstance(missing, list) else [])]
+        missing = self.page.get("missing")
+        lines = [self.page.get("status"), *(missing if isinstance(missing, list) else [])]
         return [plain(str(line)[:_LONGEST]) for line in lines]
 
     def show(self, *, as_json: bool) -> int:
         """Prints it. Returns the exit code."""
-        for line in [json.dumps(self.told, indent=2)] if as_json else self.lines():
+        for line in [json.dumps(self.page, indent=2)] if as_json else self.lines():
             print(line)
         return 0 if self.ok else NOT_READY
 
@@ -65,13 +65,13 @@ def ask(url: str, *, live: bool) -> Answer:
         raise BusError(f"{url} cannot be reached: {error.strerror or error}") from error
     head, _, body = reply.partition(b"\r\n\r\n")
     protocol, code, *_ = [*head.decode("ascii", "replace").split(None, 2), "", ""]
-    told = None
+    page = None
     if protocol.startswith("HTTP/") and code in ("200", "503"):
         with suppress(ValueError, RecursionError):
-            told = json.loads(body)
-    if not isinstance(told, dict) or "status" not in told:
+            page = json.loads(body)
+    if not isinstance(page, dict) or "status" not in page:
         raise BusError(f"{url} answers {code[:20]!r}: there is no page of health")
-    return Answer(code == "200", told)
+    return Answer(code == "200", page)
 
 
 def _place(url: str) -> tuple[str, int, str]:

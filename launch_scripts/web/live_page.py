@@ -68,7 +68,7 @@ class LivePage:
         pages |= {
             "/": self._entrance,
             _BANNER: lambda query, headers: Reply(200, "text/javascript", banner),
-            "/run.json": self._told,
+            "/run.json": self._run_json,
             "/terrain.webp": self._picture,
         }
         self.server = Server("web_port", port, pages, lasts_s=_LASTS_S)
@@ -78,14 +78,14 @@ class LivePage:
         """True while a page polls, be it before its viewer has a stream."""
         return time.monotonic() - self._asked_s < _POLLED_WITHIN_S
 
-    def _told(self, query: str, headers: Message) -> Reply:
+    def _run_json(self, query: str, headers: Message) -> Reply:
         self._asked_s = time.monotonic()
         if self.server.behind is not None and not self._files and not self._fetching.locked():
             threading.Thread(
                 target=self._file, args=("/", query, headers), name="viewer-files", daemon=True
             ).start()
-        told = {**self.run(), "view": bool(self._files), "picture": self.terrain is not None}
-        return Reply(200, "application/json", json.dumps(told).encode())
+        fields = {**self.run(), "view": bool(self._files), "picture": self.terrain is not None}
+        return Reply(200, "application/json", json.dumps(fields).encode())
 
     def _picture(self, query: str, headers: Message) -> Reply:
         from launch_scripts.observe.palette import terrain_picture  # NumPy, and PIL
@@ -101,8 +101,8 @@ class LivePage:
             return self._file("/", query, headers)
         if not self._files:
             return Reply(200, "text/html; charset=utf-8", _START_PAGE)
-        told = {"url": f"rerun+http://{headers['host']}/proxy", "theme": "dark", "hide_welcome_screen": "1"}
-        return Reply(302, "text/plain", b"", {"Location": f"/?{urllib.parse.urlencode(told)}"})
+        params = {"url": f"rerun+http://{headers['host']}/proxy", "theme": "dark", "hide_welcome_screen": "1"}
+        return Reply(302, "text/plain", b"", {"Location": f"/?{urllib.parse.urlencode(params)}"})
 
     def _file(self, path: str, query: str, headers: Message) -> Reply:
         with self._fetching:
@@ -111,8 +111,8 @@ class LivePage:
                     self._files = _take_files()
                 except (OSError, StoreError) as error:
                     log.warning("no viewer to serve: %s", error)
-                    told = b"the viewer program cannot be started; see the monitor's log\n"
-                    return Reply(503, "text/plain", told)
+                    text = b"the viewer program cannot be started; see the monitor's log\n"
+                    return Reply(503, "text/plain", text)
         return self._files[path]
 
 

@@ -109,12 +109,12 @@ def _add_targets(made: Families, counts: Counts, status: Mapping[str, PlannerSta
         made.add(Counter, "target_captures", {"target": target}, count)
     for target, gaps in counts.histograms_by(GAPS_TO).items():
         made.add(HistogramOf, "target_certified_gap_ratio", {"target": target}, *_buckets(gaps.buckets, 1.0))
-    for target, told in sorted(status.items()):
+    for target, state in sorted(status.items()):
         for name, value in {
-            "vehicles_following": told.following,
-            "tree_age_seconds": told.tree_age_ms * 1e-3,
-            "pose_age_seconds": told.pose_age_s,
-            "lost": float(told.tracker_lost),
+            "vehicles_following": state.following,
+            "tree_age_seconds": state.tree_age_ms * 1e-3,
+            "pose_age_seconds": state.pose_age_s,
+            "lost": float(state.tracker_lost),
         }.items():
             if value is not None:
                 made.add(Gauge, f"target_{name}", {"target": target}, value)
@@ -128,16 +128,16 @@ def _add_processes(made: Families, counts: Counts, up: Collection[tuple[str, str
         made.add(Gauge, "process_start_time_seconds", process, stats.incarnation / NS_PER_S)
         made.add(Gauge, "process_reported_timestamp_seconds", process, stats.stamp_ns / NS_PER_S)
     for kind, field in ((Counter, "counts"), (Gauge, "gauges"), (HistogramOf, "histograms")):
-        told = [(process, getattr(stats, field)) for process, stats in newest.values()]
-        for wire in sorted({name for _, values in told for name in values}):
-            _add_counted(made, kind, wire, [(each, values[wire]) for each, values in told if wire in values])
+        samples = [(process, getattr(stats, field)) for process, stats in newest.values()]
+        for wire in sorted({name for _, values in samples for name in values}):
+            _add_counted(made, kind, wire, [(each, values[wire]) for each, values in samples if wire in values])
 
 
-def _add_counted(made: Families, kind: Any, wire: str, told: Iterable[tuple[dict[str, str], Any]]) -> None:
+def _add_counted(made: Families, kind: Any, wire: str, samples: Iterable[tuple[dict[str, str], Any]]) -> None:
     """Adds what processes count under one name, which may be any text."""
     name, worth, text = named(wire)
     split = next((start for start in _SPLIT if kind is Gauge and wire.startswith(start)), None)
-    for process, value in told:
+    for process, value in samples:
         if split is not None:
             family, label = _SPLIT[split]
             made.add(kind, family, {**process, label: wire.removeprefix(split)}, value, of=split)

@@ -12,7 +12,7 @@ from support.effort import few
 from launch_scripts.gateways.mavlink import mavlink_codec as codec
 from launch_scripts.gateways.mavlink.adapter import Action, Follow, Report, Unfollow
 from launch_scripts.gateways.mavlink.arming import ARDUPILOT, PX4, Arming, kind_of
-from launch_scripts.gateways.mavlink.guidance import MOST_TRIES, RETRY_NS, Way, Wishes
+from launch_scripts.gateways.mavlink.guidance import MOST_TRIES, RETRY_NS, Options, Way
 from swarm.clock import NS_PER_S
 
 OF_THE_WHEEL = (codec.ARM_DISARM, codec.DO_SET_MODE, codec.MISSION_START, codec.NAV_TAKEOFF)
@@ -50,7 +50,7 @@ incoming = st.one_of(
     st.builds(codec.CommandAnswered, st.sampled_from([*OF_THE_WHEEL, 511]), st.integers(0, 6)),
     st.builds(codec.Warned, st.text(max_size=5)),
 )
-ways = st.sampled_from([mav.TO_THE_EAST, mav.WITH_A_TURN, mav.NOWHERE])
+routes = st.sampled_from([mav.TO_THE_EAST, mav.WITH_A_TURN, mav.NOWHERE])
 
 
 def became(**values: object) -> Callable[[mav.World], object]:
@@ -67,7 +67,7 @@ steps = st.lists(
     st.tuples(
         st.one_of(
             incoming.map(lambda message: lambda world: world.hear(message)),
-            ways.map(lambda way: lambda world: world.adapter.hear_way(way)),
+            routes.map(lambda way: lambda world: world.adapter.hear_way(way)),
             st.booleans().map(lambda up: lambda world: world.adapter.hear_swarm(up)),
             st.booleans().map(lambda speaks: became(speaks=speaks)),
             st.booleans().map(lambda answers: became(answers=answers)),
@@ -84,7 +84,7 @@ steps = st.lists(
 @settings(max_examples=few(250), deadline=None)
 @given(
     steps, kinds, st.sampled_from(["mission", "guided"]), st.booleans(), st.sampled_from([None, 30.0]),
-    st.sampled_from([None, "t0", "t0", "t0"]), st.booleans(), ways,
+    st.sampled_from([None, "t0", "t0", "t0"]), st.booleans(), routes,
 )  # fmt: skip
 def test_whatever_comes_the_vehicle_is_told_what_it_may_be_told_and_hears_us_each_second(
     steps: list[tuple[Callable[[mav.World], object], int]],
@@ -96,8 +96,8 @@ def test_whatever_comes_the_vehicle_is_told_what_it_may_be_told_and_hears_us_eac
     answers: bool,
     way: Way,
 ) -> None:
-    wishes = Wishes(target, drive, arm, altitude_m, lost_s=LOST_S)  # type: ignore[arg-type]
-    world = mav.World(wishes, mav.Autopilot(*kind, answers=answers))
+    options = Options(target, drive, arm, altitude_m, lost_s=LOST_S)  # type: ignore[arg-type]
+    world = mav.World(options, mav.Autopilot(*kind, answers=answers))
     laws = Laws(world)
     laws.run(20)
     world.adapter.hear_way(way)
@@ -114,7 +114,7 @@ class Laws:
     def __init__(self, world: mav.World) -> None:
         self.world = world
         self.heartbeat_ns = world.now_ns
-        self.heard_ns = {codec.Beat: -NS_PER_S * 1000, codec.Position: -NS_PER_S * 1000}
+        self.received_ns = {codec.Beat: -NS_PER_S * 1000, codec.Position: -NS_PER_S * 1000}
         self.answered_ns = -NS_PER_S
         self.asked_ns = -NS_PER_S
         self.spoken: Action | None = None
@@ -126,8 +126,8 @@ class Laws:
         hear = world.adapter.on_message
 
         def listen(message: codec.Incoming, now_ns: int) -> None:
-            if type(message) in self.heard_ns:
-                self.heard_ns[type(message)] = now_ns
+            if type(message) in self.received_ns:
+                self.received_ns[type(message)] = now_ns
             # Any answer of the vehicle, and each refusal, may end an upload.
             if isinstance(message, codec.MissionAnswered):
                 self.answered_ns = now_ns
@@ -146,12 +146,12 @@ class Laws:
             if isinstance(action, codec.Heartbeat):
                 self.heartbeat_ns = now_ns
             if isinstance(action, codec.Command) and action.command in OF_THE_WHEEL:
-                assert self.world.wishes.arm, "nobody has asked us to arm it, or to change its mode"
+                assert self.world.options.arm, "nobody has asked us to arm it, or to change its mode"
             if isinstance(action, (*TO_THE_VEHICLE, Follow)):
-                lost = now_ns - min(self.heard_ns.values()) > LOST_S * NS_PER_S
+                lost = now_ns - min(self.received_ns.values()) > LOST_S * NS_PER_S
                 asks = isinstance(action, codec.Command) and action.command == codec.SET_MESSAGE_INTERVAL
                 assert not lost or asks, "it is left to its own fail-safe"
-                assert self.world.wishes.target is not None or asks, "it is not ours to drive"
+                assert self.world.options.target is not None or asks, "it is not ours to drive"
             if isinstance(action, codec.Setpoint | codec.MissionCount | codec.MissionItem):
                 if isinstance(action, codec.Setpoint) and self.world.vehicle.autopilot == ARDUPILOT:
                     continue  # which holds at one
@@ -189,13 +189,13 @@ class Laws:
         self.spoken, self.spoken_ns = action, now_ns
 
 
-looks = st.tuples(st.booleans(), modes, st.sampled_from(["drive", "hold"]), st.floats(0, 5), st.floats(0, 50))
+beats = st.tuples(st.booleans(), modes, st.sampled_from(["drive", "hold"]), st.floats(0, 5), st.floats(0, 50))
 
 
 @settings(max_examples=few(400), deadline=None)
-@given(kinds, st.booleans(), st.lists(looks, max_size=40))
+@given(kinds, st.booleans(), st.lists(beats, max_size=40))
 def test_another_driver_that_takes_the_wheel_keeps_it(
-    kind: tuple[int, int], guided: bool, looks: list[tuple[bool, int, str, float, float]]
+    kind: tuple[int, int], guided: bool, beats: list[tuple[bool, int, str, float, float]]
 ) -> None:
     made = kind_of(codec.Beat(*kind, armed=False, mode=mav.MANUAL))
     mode = None if made.modes is None else made.modes.guided if guided else made.modes.mission
@@ -205,14 +205,14 @@ def test_another_driver_that_takes_the_wheel_keeps_it(
     wheel = Arming(made, mode, starts=not guided, takeoff_m=None)
     drove = held = taken_away = False
     now_s = 0.0
-    for armed, at, wish, for_s, height_m in looks:
+    for armed, at, wish, for_s, height_m in beats:
         now_s += for_s
         beat, now_ns = codec.Beat(*kind, armed, at), int(now_s * NS_PER_S)
         drives = armed and (mode is None or at == mode)
         drove = drove or drives
         foreign = drove and not drives and not (armed and held and at == hold)
-        said = wheel.drive(beat, height_m, now_ns) if wish == "drive" else wheel.hold(beat, now_ns)
-        command = said[0] if said else None
+        actions = wheel.drive(beat, height_m, now_ns) if wish == "drive" else wheel.hold(beat, now_ns)
+        command = actions[0] if actions else None
         held = held or (command is not None and wish == "hold")
         assert not (foreign and command is not None), "somebody else has set this mode"
         taken_away = taken_away or (foreign and bool(wheel.why))

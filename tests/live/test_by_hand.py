@@ -64,7 +64,7 @@ def test_a_keeper_waits_is_ready_hangs_and_loses_its_router(
                 answer = ask(url, live=False)
             except BusError:
                 return None
-            found: list[str] = answer.told["missing"]
+            found: list[str] = answer.page["missing"]
             assert answer.ok == (not found)
             return found
 

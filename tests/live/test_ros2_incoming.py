@@ -104,13 +104,13 @@ def ends_of(swarm: Swarm, message: dict[str, Any]) -> list[tuple[int, int]]:
 def plan_of(peer: RosPeer, robot: str, **request: Any) -> dict[str, Any]:
     """A plan that has poses. It is asked for again, as the planner of a busy machine may be late."""
     certificate = f"/{robot}/plan_certificate"
-    if certificate not in peer.heard:
+    if certificate not in peer.received:
         peer.hear(certificate, CERTIFICATE)
     for _ in range(4):
         plan: dict[str, Any] = peer.ask(f"/{robot}/get_plan", PLAN, **request)["message"]["plan"]
         if plan["poses"]:
             return plan
-    raise AssertionError(f"no plan: {[each['message'] for each in peer.heard[certificate]]}")
+    raise AssertionError(f"no plan: {[each['message'] for each in peer.received[certificate]]}")
 
 
 def test_a_robot_is_a_vehicle_that_is_seen_follows_its_target_and_leaves_within_its_lease(
@@ -127,10 +127,10 @@ def test_a_robot_is_a_vehicle_that_is_seen_follows_its_target_and_leaves_within_
     there = seen.vehicles["uav1"]
     assert swarm.frame.grid.row_col(swarm.frame.cell(there.x_m, there.y_m)) == (40, 60)
     assert there.heading_rad == pytest.approx(0.0, abs=1e-3)
-    eventually(lambda: any(each["poses"] for each in peer.heard["/uav1/plan"]), 15, "its plan")
-    plan = next(each for each in peer.heard["/uav1/plan"] if each["poses"])
+    eventually(lambda: any(each["poses"] for each in peer.received["/uav1/plan"]), 15, "its plan")
+    plan = next(each for each in peer.received["/uav1/plan"] if each["poses"])
     assert ends_of(swarm, plan) == [(40, 60), (60, 90)]
-    eventually(lambda: peer.heard["/uav1/goal_pose"], 5, "the place to go")
+    eventually(lambda: peer.received["/uav1/goal_pose"], 5, "the place to go")
     peer.kill()
     killed_s = time.monotonic()
     eventually(lambda: "uav1" not in seen.vehicles, 8, "its leaving")
@@ -145,10 +145,10 @@ def test_a_goal_that_ros_gives_is_answered_with_a_plan_and_its_certificate(swarm
     def planned() -> bool:
         peer.put("/uav2/goal_pose", POSE, **pose_at(swarm, 50, 45))
         time.sleep(0.5)
-        return any(ends_of(swarm, each)[1:] == [(50, 45)] for each in peer.heard["/uav2/plan"])
+        return any(ends_of(swarm, each)[1:] == [(50, 45)] for each in peer.received["/uav2/plan"])
 
     eventually(planned, 15, "a plan to the goal")
-    certified = [{v["key"]: v["value"] for v in each["values"]} for each in peer.heard["/uav2/plan_certificate"]]
+    certified = [{v["key"]: v["value"] for v in each["values"]} for each in peer.received["/uav2/plan_certificate"]]
     good = next(each for each in certified if each.get("target") == "")
     assert 0 < float(good["lower_bound_s"]) <= float(good["cost_s"]) * (1 + 1e-6)
 
@@ -165,7 +165,7 @@ def test_a_client_of_a_foreign_stack_gets_plans_and_reasons(swarm: Swarm, peer: 
     assert nowhere["message"]["plan"]["poses"] == []
     eventually(
         lambda: (
-            peer.heard["/uav3/plan_certificate"][-1]["message"]
+            peer.received["/uav3/plan_certificate"][-1]["message"]
             == "goal: frame is 'uav9/odom', expected 'map' or 'uav3/odom' or 'terrain'"
         ),
         5,
@@ -180,9 +180,9 @@ def test_the_map_is_answered_and_the_robot_is_not_told_twice(swarm: Swarm, peer:
     peer.hear("/uav4/odom", ODOMETRY)
     peer.hear("/uav4/pose", POSE)
     drive(peer, swarm, "uav4", 30, 40)
-    eventually(lambda: peer.heard["/uav4/odom"], 5, "its own odometry")
+    eventually(lambda: peer.received["/uav4/odom"], 5, "its own odometry")
     time.sleep(1.5)
-    assert not peer.heard["/uav4/pose"]
+    assert not peer.received["/uav4/pose"]
 
 
 def test_pause_is_an_order_that_a_service_gives_and_takes_back(swarm: Swarm, peer: RosPeer) -> None:

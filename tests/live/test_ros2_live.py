@@ -135,9 +135,9 @@ def test_the_gateway_ends_at_ctrl_c_and_says_what_it_lacks(live: LiveSwarm, port
 def poses_heard(port: int, within_s: float) -> None:
     """Waits until a node at this router hears where vehicles are."""
     with open_ros(f"tcp/127.0.0.1:{port}") as session:
-        heard: list[object] = []
-        PeerNode(session, "hearer", TYPES).subscribe("/swarm/poses", ROWS["poses"].type_name, heard.append)
-        eventually(lambda: heard, within_s, "poses of vehicles")
+        received: list[object] = []
+        PeerNode(session, "hearer", TYPES).subscribe("/swarm/poses", ROWS["poses"].type_name, received.append)
+        eventually(lambda: received, within_s, "poses of vehicles")
 
 
 @contextmanager
@@ -163,16 +163,16 @@ def test_a_foreign_stack_hears_every_type(tmp_path: Path, definitions: Path) -> 
         for row in OUT:
             peer.hear(topic_of(row), ROWS[row].type_name)
         ends.enter_context(gateway_of(network, port, tmp_path))
-        eventually(lambda: all(peer.heard[topic_of(row)] for row in OUT), 40, "a message of each topic")
-        pose = peer.heard[topic_of("pose")][-1]
+        eventually(lambda: all(peer.received[topic_of(row)] for row in OUT), 40, "a message of each topic")
+        pose = peer.received[topic_of("pose")][-1]
         assert pose["header"]["frame_id"] == "map"
         assert pose["header"]["stamp"]["sec"] == pytest.approx(time.time(), abs=60)
         assert 500 < pose["pose"]["position"]["x"] < 4000
         assert pose["pose"]["position"]["y"] == pytest.approx(20_480 - 500)
-        assert len(peer.heard["/swarm/poses"][-1]["poses"]) == 25
-        assert len(peer.heard[topic_of("plan")][-1]["poses"]) == 201
-        assert peer.heard[topic_of("fix")][-1]["latitude"] == pytest.approx(47.85, abs=0.2)
-        assert peer.heard["/map"][0]["info"]["width"] == 2048
+        assert len(peer.received["/swarm/poses"][-1]["poses"]) == 25
+        assert len(peer.received[topic_of("plan")][-1]["poses"]) == 201
+        assert peer.received[topic_of("fix")][-1]["latitude"] == pytest.approx(47.85, abs=0.2)
+        assert peer.received["/map"][0]["info"]["width"] == 2048
 
 
 def test_either_side_may_go_and_come_back_and_the_next_run_is_told_as_well(tmp_path: Path) -> None:

@@ -220,7 +220,7 @@ def rows_in(text: str) -> list[list[str]]:
 
 def table_of(state: RunState) -> str:
     console = Console(file=io.StringIO(), width=250, height=80)
-    console.print(live_table(state, f"time {facts.fact('elapsed_s').shown(state)}", console))
+    console.print(live_table(state, f"time {facts.fact('elapsed_s').format(state)}", console))
     return console.file.getvalue()  # type: ignore[attr-defined, no-any-return]
 
 
@@ -250,7 +250,7 @@ def test_no_fact_shown_in_two_places_differs(scenario: Scenario, plan: Callable[
 
     shown = {place: shown_in(text) for place, text in texts.items()}
     told = (fact for names in (("elapsed_s",), *facts.LINES) for fact in map(facts.fact, names))
-    labels = {fact.label for fact in told if fact.shown(state) != facts.NONE}
+    labels = {fact.label for fact in told if fact.format(state) != facts.NONE}
     for place, found in shown.items():
         assert labels <= found.keys(), place
     assert shown["view"] == shown["table"]
@@ -259,7 +259,7 @@ def test_no_fact_shown_in_two_places_differs(scenario: Scenario, plan: Callable[
         for fact in facts.FACTS:
             if fact.name == "elapsed_s" and place == "report":  # which ends with the last message
                 continue
-            assert fact.text(report[fact.name]) == shown["table"].get(fact.label, fact.shown(state)), (place, fact)
+            assert fact.text(report[fact.name]) == shown["table"].get(fact.label, fact.format(state)), (place, fact)
     assert rows_in(texts["view"]) == rows_in(texts["table"]) == rows_in(texts["status"])
     lasting = [alarm.line for alarm in state.alarms if alarm.lasts]
     alarms = {place: {line for line in lasting if line in text} for place, text in texts.items()}

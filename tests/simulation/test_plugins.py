@@ -40,14 +40,14 @@ def _own_modules(tmp_path: Path) -> Iterator[None]:
 def run(scenario: Path, seconds: float = SECONDS) -> tuple[Simulation, list[str]]:
     simulation = Simulation(load_scenario(scenario))
     notes: list[str] = []
-    heard = simulation.recorder.heard
+    heard = simulation.recorder.on_message
 
     def listen(message: object, *rest: object) -> None:
         if isinstance(message, Note) and message.kind == "plugin_failed":
             notes.append(f"{message.role} {message.id}: {message.text}")
         heard(message, *rest)  # type: ignore[arg-type]
 
-    simulation.recorder.heard = listen  # type: ignore[method-assign, assignment]
+    simulation.recorder.on_message = listen  # type: ignore[method-assign, assignment]
     simulation.run_until(seconds)
     return simulation, notes
 

@@ -36,7 +36,7 @@ def fake_run(terrain: Terrain, truth: Floats, scenario: Scenario) -> Iterator[tu
         if up:
             told.append((now_ns - BEGAN_NS, peer))
 
-    simulation.recorder.heard, simulation.recorder.alive = heard, alive  # type: ignore[method-assign]
+    simulation.recorder.on_message, simulation.recorder.alive = heard, alive  # type: ignore[method-assign]
     simulation.run_until(scenario.seconds)
     yield from told
 
@@ -70,7 +70,7 @@ def leave_run(folder: Path) -> Recorder:
     truth[28:40, 8:60], truth[5:12, 45:55] = np.inf, 0.3
     recorder = played(terrain, truth, scenario)
     note = Note(role="agent", id="a0", stamp_ns=1, kind="odd", text=HOSTILE, cell=None, target=None)
-    recorder.heard(note, recorder.observed.last_ns or 0)
+    recorder.on_message(note, recorder.observed.last_ns or 0)
     (folder / "scenario.toml").write_text(f"# {HOSTILE}\n" + scenario_text(scenario, folder))
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr("launch_scripts.report.run_page_and_map.save_picture", lambda half, *_: half.touch())

@@ -5,7 +5,7 @@ from dataclasses import dataclass, field
 from launch_scripts.gateways.mavlink import mavlink_codec as codec
 from launch_scripts.gateways.mavlink.adapter import Action, Adapter
 from launch_scripts.gateways.mavlink.arming import ARDUPILOT, PX4
-from launch_scripts.gateways.mavlink.guidance import Way, Wishes
+from launch_scripts.gateways.mavlink.guidance import Options, Way
 from swarm.client import Frame
 from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec
@@ -80,24 +80,24 @@ class Autopilot:
 class World:
     """Ticks the core twenty times a second, with a heartbeat a second and ten positions while the vehicle speaks.
 
-    said  what the core has said, with when it did
+    sent  actions of the core, with their times
     """
 
-    def __init__(self, wishes: Wishes, vehicle: Autopilot | None = None) -> None:
+    def __init__(self, options: Options, vehicle: Autopilot | None = None) -> None:
         self.vehicle = vehicle or Autopilot()
-        self.adapter = Adapter(FRAME, wishes)
-        self.wishes = wishes
+        self.adapter = Adapter(FRAME, options)
+        self.options = options
         self.now_ns = 100 * NS_PER_S
         self.speaks = True
-        self.said: list[tuple[int, Action]] = []
+        self.sent: list[tuple[int, Action]] = []
         self._ticks = 0
 
     def run(self, seconds: float) -> list[Action]:
         """Messages meanwhile."""
-        before = len(self.said)
+        before = len(self.sent)
         for _ in range(round(seconds * NS_PER_S / TICK_NS)):
             self.tick()
-        return [action for _, action in self.said[before:]]
+        return [action for _, action in self.sent[before:]]
 
     def tick(self) -> list[Action]:
         if self.speaks and self._ticks % 20 == 0:
@@ -107,7 +107,7 @@ class World:
         self._ticks += 1
         self.now_ns += TICK_NS
         actions = self.adapter.tick(self.now_ns)
-        self.said += [(self.now_ns, action) for action in actions]
+        self.sent += [(self.now_ns, action) for action in actions]
         if self.speaks:
             for action in actions:
                 for answer in self.vehicle.hear(action):
@@ -117,5 +117,5 @@ class World:
     def hear(self, message: codec.Incoming) -> None:
         self.adapter.on_message(message, self.now_ns)
 
-    def told(self) -> list[str]:
-        return [action for _, action in self.said if isinstance(action, str)]
+    def sentences(self) -> list[str]:
+        return [action for _, action in self.sent if isinstance(action, str)]

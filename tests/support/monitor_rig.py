@@ -9,7 +9,7 @@ from support import fake_run
 from support.swarm_model import SwarmModel
 
 from launch_scripts.monitor.ground_view import Scene
-from launch_scripts.monitor.live_layout import make_blueprint, shown_layers
+from launch_scripts.monitor.live_layout import layers_of, make_blueprint
 from launch_scripts.monitor.rerun_outputs import Pen, Sinks
 from launch_scripts.monitor.service import MonitorService
 from launch_scripts.monitor.terrain_mesh import TerrainMesh
@@ -72,7 +72,7 @@ class Rig(SwarmModel):
         super().__init__(terrain=terrain, scenario=scenario, start_ns=0)
         self.speaker = self.bus("speaker")
         mesh = self.mesh = TerrainMesh(terrain)
-        layers = shown_layers(scenario, knows_truth=False)
+        layers = layers_of(scenario, knows_truth=False)
         self.sinks = Sinks("run.1", path, config, make_blueprint(mesh, layers))
         scene = Scene(Pen(self.sinks.streams, mesh), layers)
         setup = self.setup("monitor", "0")

@@ -20,11 +20,11 @@ class PeerNode(Node):
     def subscribe(self, topic: str, type_name: str, hear: Callable[[Any], None], qos: Qos = Qos.DEFAULT) -> None:
         """Calls `hear` with what came last, on a thread of its own."""
         row = TopicRow("heard", topic, type_name, qos, "", hz=1000.0)
-        heard = Input(self, topic, row, lambda message, _: hear(message), most_bytes=LARGEST_MESSAGE_BYTES)
+        reader = Input(self, topic, row, lambda message, _: hear(message), most_bytes=LARGEST_MESSAGE_BYTES)
 
         def read() -> None:
-            while heard.endpoint in self.endpoints:
-                heard.tick(time.monotonic_ns())
+            while reader.endpoint in self.endpoints:
+                reader.tick(time.monotonic_ns())
                 time.sleep(0.002)
 
         threading.Thread(target=read, daemon=True).start()
@@ -33,19 +33,19 @@ class PeerNode(Node):
 class FakeNode:
     """A node whose topics a test hears and says.
 
-    heard   topic -> messages that were put
-    topics  topic -> where a test puts a message that comes
+    received  topic -> messages that were put
+    topics    topic -> where a test puts a message that comes
     """
 
     def __init__(self, types: RosTypes) -> None:
         self.types = types
         self.name = NodeName(0, "fake", "swarm_gateway")
-        self.tell: Callable[[Endpoint, bool], None] = lambda seen, there: None
+        self.report: Callable[[Endpoint, bool], None] = lambda seen, there: None
         self.topics: dict[str, Any] = {}
-        self.heard: dict[str, list[Any]] = {}
+        self.received: dict[str, list[Any]] = {}
 
     def watch(self, domain: str, seen: Callable[[Endpoint, bool], None]) -> None:
-        self.tell = seen
+        self.report = seen
 
     def listen(self, topic: str, row: TopicRow, keep: Callable[[Any], object]) -> Any:
         self.topics[topic] = SimpleNamespace(waiting=SimpleNamespace(append=keep))
@@ -55,8 +55,8 @@ class FakeNode:
         return sample
 
     def publisher(self, topic: str, *_: Any) -> Any:
-        told = self.heard.setdefault(topic, [])
-        return SimpleNamespace(endpoint=topic, put=told.append)
+        messages = self.received.setdefault(topic, [])
+        return SimpleNamespace(endpoint=topic, put=messages.append)
 
     def serve(self, name: str, *_: Any) -> str:
         return name

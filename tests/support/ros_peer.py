@@ -102,7 +102,7 @@ class RosPeer:
                 [sys.executable, str(_PROGRAM), str(definitions), str(port), str(_LONGEST_S)],
                 stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=log, text=True, env=environment,
             )  # fmt: skip
-        self.heard: dict[str, list[Any]] = {}
+        self.received: dict[str, list[Any]] = {}
         """Topic -> messages as JSON has them, the oldest first."""
         self._other: queue.Queue[dict[str, Any]] = queue.Queue()
         threading.Thread(target=self._read, daemon=True).start()
@@ -115,8 +115,8 @@ class RosPeer:
         self.kill()
 
     def hear(self, topic: str, type_name: str) -> None:
-        """Subscribes: received messages are in `heard`."""
-        self.heard.setdefault(topic, [])
+        """Subscribes: received messages are in `received`."""
+        self.received.setdefault(topic, [])
         self._do("hear", topic=topic, type=type_name)
 
     def put(self, topic: str, type_name: str, hz: float | None = None, **fields: Any) -> None:
@@ -145,20 +145,20 @@ class RosPeer:
         until_s = time.monotonic() + within_s
         while True:
             try:
-                said = self._other.get(timeout=max(until_s - time.monotonic(), 0.01))
+                reply = self._other.get(timeout=max(until_s - time.monotonic(), 0.01))
             except queue.Empty:
-                said = {"ended": True}
-            assert "ended" not in said, f"the peer did not say {word!r}: {self._log.read_text()}"
-            if word in said:
+                reply = {"ended": True}
+            assert "ended" not in reply, f"the peer did not say {word!r}: {self._log.read_text()}"
+            if word in reply:
                 return answer
-            answer = said
+            answer = reply
 
     def _read(self) -> None:
         assert self.process.stdout is not None
         for line in self.process.stdout:
-            said = json.loads(line)
-            if "heard" in said:
-                self.heard[said["heard"]].append(said["message"])
+            reply = json.loads(line)
+            if "received" in reply:
+                self.received[reply["received"]].append(reply["message"])
             else:
-                self._other.put(said)
+                self._other.put(reply)
         self._other.put({"ended": True})

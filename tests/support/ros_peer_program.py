@@ -22,19 +22,19 @@ get_registry(DEFINITIONS)  # the first call wins: definitions from here, no git
 from zenoh_ros2_sdk import ROS2Publisher, ROS2ServiceClient, ROS2Subscriber  # noqa: E402
 from zenoh_ros2_sdk.session import ZenohSession  # noqa: E402
 
-_MOST_TOLD = 4096
+_MOST_ITEMS = 4096
 """Elements of an array that are printed, which keeps a map readable as a line."""
 
 
-def told(value: Any) -> Any:
+def as_fields(value: Any) -> Any:
     """A message as JSON has it."""
     if dataclasses.is_dataclass(value):
         fields = (field.name for field in dataclasses.fields(value) if not field.name.startswith("__"))
-        return {name: told(getattr(value, name)) for name in fields}
+        return {name: as_fields(getattr(value, name)) for name in fields}
     if isinstance(value, np.ndarray):
-        return value[:_MOST_TOLD].tolist()
+        return value[:_MOST_ITEMS].tolist()
     if isinstance(value, (list, tuple)):
-        return [told(each) for each in value[:_MOST_TOLD]]
+        return [as_fields(each) for each in value[:_MOST_ITEMS]]
     return value
 
 
@@ -78,10 +78,10 @@ class Peer:
             sys.stdout.flush()
 
     def hear(self, topic: str, type: str) -> None:
-        def heard(message: Any) -> None:
-            self.say(heard=topic, message=told(message))
+        def received(message: Any) -> None:
+            self.say(received=topic, message=as_fields(message))
 
-        self._kept.append(ROS2Subscriber(topic=topic, msg_type=type, callback=heard, router_port=PORT))
+        self._kept.append(ROS2Subscriber(topic=topic, msg_type=type, callback=received, router_port=PORT))
 
     def put(self, topic: str, type: str, fields: dict[str, Any], hz: float | None = None) -> None:
         if topic not in self._publishers:
@@ -107,7 +107,7 @@ class Peer:
         parts = {name: value for name, value in parts.items() if not name.startswith("__")}
         began_ns = time.perf_counter_ns()
         response = self._clients[service].call(**parts)
-        self.say(answer=service, message=told(response), took_ms=(time.perf_counter_ns() - began_ns) / 1e6)
+        self.say(answer=service, message=as_fields(response), took_ms=(time.perf_counter_ns() - began_ns) / 1e6)
 
     def _publish(self, topic: str, message: Any) -> None:
         parts = {field.name: getattr(message, field.name) for field in dataclasses.fields(message)}

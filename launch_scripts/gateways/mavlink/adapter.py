@@ -70,10 +70,10 @@ class Adapter:
     kind  its type and make, from its first heartbeat; None before
     """
 
-    def __init__(self, frame: Frame, wishes: guidance.Wishes) -> None:
+    def __init__(self, frame: Frame, options: guidance.Options) -> None:
         self.kind: Kind | None = None
         self._frame = frame
-        self._wishes = wishes
+        self._options = options
         self._beat: codec.Beat | None = None
         self._at: tuple[codec.Position, Point] | None = None
         """The newest position, and its place in the terrain's frame; None outside of it."""
@@ -89,8 +89,8 @@ class Adapter:
         """None: the vehicle is not driven."""
         self._arming: Arming | None = None
         """None: another controller arms the vehicle and sets its mode."""
-        self._untold: list[str] = []
-        self._told_this_minute: set[str] = set()
+        self._unsent: list[str] = []
+        self._sent_this_minute: set[str] = set()
         """Sentences of this minute."""
         self._due_ns = Counter[str]()
         """Time when a thing that is done once a period is due again."""
@@ -105,9 +105,9 @@ class Adapter:
             case codec.Position():
                 self._hear_position(message, now_ns)
             case codec.Warned(text=text) if self._is_due("warning", _WARN_NS, now_ns):
-                self._untold.append(f"the vehicle says: {text}")
+                self._unsent.append(f"the vehicle says: {text}")
             case codec.CommandAnswered() if self._arming is not None:
-                self._untold += self._arming.on_command_answer(message)
+                self._unsent += self._arming.on_command_answer(message)
             case codec.ItemAsked() | codec.MissionAnswered() if isinstance(self._guide, guidance.Missions):
                 self._guide.on_mission_message(message)
 
@@ -119,7 +119,7 @@ class Adapter:
         """Takes in whether the swarm can be heard."""
         if up != self._swarm_up:
             lost = "the swarm is silent: its routes are followed no more"
-            self._untold.append("the swarm is back" if up else lost)
+            self._unsent.append("the swarm is back" if up else lost)
         self._swarm_up = up
 
     def _hear_beat(self, beat: codec.Beat, now_ns: int) -> None:
@@ -127,14 +127,14 @@ class Adapter:
         if self.kind is None:
             self.kind = kind
             armed = "armed" if beat.armed else "disarmed"
-            self._untold.append(f"found {kind.name}, MAV_TYPE {beat.type}, {armed}")
-            if self._wishes.target is not None:
+            self._unsent.append(f"found {kind.name}, MAV_TYPE {beat.type}, {armed}")
+            if self._options.target is not None:
                 try:
-                    self._guide, self._arming = guidance.guidance_of(kind, self._frame, self._wishes)
+                    self._guide, self._arming = guidance.guidance_of(kind, self._frame, self._options)
                 except ConfigError as error:
-                    self._untold.append(f"the vehicle is not driven: {error}")
+                    self._unsent.append(f"the vehicle is not driven: {error}")
         if kind != self.kind:
-            self._untold.append("another kind of vehicle speaks under the same number: it is ignored")
+            self._unsent.append("another kind of vehicle speaks under the same number: it is ignored")
             return
         self._beat, self._beat_ns = beat, now_ns
 
@@ -160,9 +160,9 @@ class Adapter:
             actions += self._report(now_ns)
             actions += self._drive(now_ns)
             if self._arming is not None and self._arming.why:
-                self._untold.append(f"the vehicle's mode and motors are left alone from now on: {self._arming.why}")
+                self._unsent.append(f"the vehicle's mode and motors are left alone from now on: {self._arming.why}")
                 self._arming = None
-        self._untold += [each for each in actions if isinstance(each, str)]
+        self._unsent += [each for each in actions if isinstance(each, str)]
         return [*(each for each in actions if not isinstance(each, str)), *self._news(now_ns)]
 
     def stop(self, now_ns: int) -> list[Action]:
@@ -179,17 +179,17 @@ class Adapter:
         if guide is None or beat is None or self._at is None:
             return []
         position, place = self._at
-        said: Sequence[Action]
+        messages: Sequence[Action]
         commands: Sequence[Action] = []
         if self._way and self._swarm_up:
-            said = guide.lead(self._way, position, place, now_ns)
+            messages = guide.lead(self._way, position, place, now_ns)
             if arming is not None and guide.ready(now_ns):
                 commands = arming.drive(beat, position.height_m, now_ns)
         else:
-            said = guide.stay(position, now_ns)
+            messages = guide.stay(position, now_ns)
             if arming is not None:
                 commands = arming.hold(beat, now_ns, last=last)
-        return [*said, *commands]
+        return [*messages, *commands]
 
     def _come_or_go(self, now_ns: int) -> list[Action]:
         why = self._why_gone(now_ns)
@@ -197,15 +197,15 @@ class Adapter:
             return []
         self._there = not why
         if not why:
-            self._untold.append("the vehicle is in the swarm")
+            self._unsent.append("the vehicle is in the swarm")
             return []
-        self._untold.append(f"{why}: the vehicle is left to its own fail-safe")
+        self._unsent.append(f"{why}: the vehicle is left to its own fail-safe")
         actions: list[Action] = []
         if self._guide is not None:
             self._guide.forget()
             self._way = ()
             actions.append(Unfollow())
-        if self._at is None or (self.kind is not None and guidance.flies(self.kind, self._wishes.altitude_m)):
+        if self._at is None or (self.kind is not None and guidance.flies(self.kind, self._options.altitude_m)):
             actions.append(Withdraw())
         else:
             # Its destination is then unknown.
@@ -216,11 +216,11 @@ class Adapter:
 
     def _why_gone(self, now_ns: int) -> str:
         """Returns why the vehicle is not there; empty if it is."""
-        lost_ns = int(self._wishes.lost_s * NS_PER_S)
+        lost_ns = int(self._options.lost_s * NS_PER_S)
         if self._beat is None or now_ns - self._beat_ns > lost_ns:
-            return f"no heartbeat for {self._wishes.lost_s:g} s"
+            return f"no heartbeat for {self._options.lost_s:g} s"
         if self._position_ns is None or now_ns - self._position_ns > lost_ns:
-            return f"no position for {self._wishes.lost_s:g} s"
+            return f"no position for {self._options.lost_s:g} s"
         return "" if self._at is not None else "it is outside the terrain"
 
     def _report(self, now_ns: int) -> list[Action]:
@@ -229,18 +229,18 @@ class Adapter:
         position, place = self._at
         first, self._reported = self._reported is None, position
         actions: list[Action] = [Report(*place, position.heading_rad, _speed(position))]
-        if first and self._guide is not None and self._wishes.target is not None:
-            actions.append(Follow(self._wishes.target))
+        if first and self._guide is not None and self._options.target is not None:
+            actions.append(Follow(self._options.target))
         return actions
 
     def _news(self, now_ns: int) -> list[str]:
         """Returns new sentences for people, each once a minute."""
         if self._is_due("minute", _SAY_AGAIN_NS, now_ns):
-            self._told_this_minute.clear()
-        not_told = [each for each in dict.fromkeys(self._untold) if each not in self._told_this_minute]
-        sentences = not_told[: _MOST_SAID - len(self._told_this_minute)]
-        self._told_this_minute.update(sentences)
-        self._untold.clear()
+            self._sent_this_minute.clear()
+        new = [each for each in dict.fromkeys(self._unsent) if each not in self._sent_this_minute]
+        sentences = new[: _MOST_SAID - len(self._sent_this_minute)]
+        self._sent_this_minute.update(sentences)
+        self._unsent.clear()
         return sentences
 
     def _is_due(self, what: str, every_ns: int, now_ns: int) -> bool:

@@ -46,7 +46,7 @@ _HOLDS = 3
 
 
 @dataclass(frozen=True)
-class Wishes:
+class Options:
     """Requested state of the vehicle.
 
     target      id of a target, or a place, to which it follows routes; None: it is avoided, and no more
@@ -80,20 +80,20 @@ def flies(kind: Kind, altitude_m: float | None) -> bool:
     return altitude_m is not None if kind.flies is None else kind.flies
 
 
-def guidance_of(kind: Kind, frame: Frame, wishes: Wishes) -> tuple[Guide, Arming | None]:
-    """Returns what guides a kind of vehicle as it is wished, and its arming; None if another controller arms it.
+def guidance_of(kind: Kind, frame: Frame, options: Options) -> tuple[Guide, Arming | None]:
+    """Returns what guides a kind of vehicle by the options, and its arming; None if another controller arms it.
     Raises ConfigError if it cannot be driven so."""
-    aloft, guided, modes = flies(kind, wishes.altitude_m), wishes.drive == "guided", kind.modes
-    height_m = wishes.altitude_m if aloft else None
+    aloft, guided, modes = flies(kind, options.altitude_m), options.drive == "guided", kind.modes
+    height_m = options.altitude_m if aloft else None
     if aloft and height_m is None:
         raise ConfigError("it flies without an altitude: give --altitude M, as the swarm publishes no heights")
-    above = codec.ABOVE_TERRAIN if aloft and wishes.above == "terrain" else codec.ABOVE_HOME
+    above = codec.ABOVE_TERRAIN if aloft and options.above == "terrain" else codec.ABOVE_HOME
     if above == codec.ABOVE_TERRAIN and kind.make != ARDUPILOT:
         raise ConfigError(f"{kind.name} takes no heights above terrain: give --above home")
     if guided and (modes is None or modes.guided is None):
         raise ConfigError(f"{kind.name} has no guided mode here; give --drive mission")
     guide = (Setpoints if guided else Missions)(kind, frame, above, height_m)
-    if not wishes.arm:
+    if not options.arm:
         return guide, None
     mode = None if modes is None else modes.guided if guided else modes.mission
     # PX4 starts its missions by their mode, and climbs to the height of its setpoints.
@@ -127,7 +127,7 @@ class Upload:
         self.items = items
         self.accepted = False
         self.why = ""
-        self._said: codec.MissionCount | codec.MissionItem = codec.MissionCount(len(items))
+        self._next: codec.MissionCount | codec.MissionItem = codec.MissionCount(len(items))
         """The next message, or the last one."""
         self._due_ns: int | None = None
         """Time when it is said (again); None: at once."""
@@ -144,12 +144,12 @@ class Upload:
                     return  # of a mission before; it asks again
                 if self._asked > _MOST_ASKED * len(self.items):
                     self.why = f"asked {self._asked} times for {len(self.items)} items"
-                self._said, self._due_ns, self._tries = self.items[seq], None, 0
+                self._next, self._due_ns, self._tries = self.items[seq], None, 0
             case codec.MissionAnswered(result=result) if result != codec.ACCEPTED:
                 self.why = f"refused it with MAV_MISSION_RESULT {result}"
             case codec.MissionAnswered():
                 # One of a mission before, while the last item of this one was not asked for, says nothing of it.
-                self.accepted = isinstance(self._said, codec.MissionItem) and self._said.seq == len(self.items) - 1
+                self.accepted = isinstance(self._next, codec.MissionItem) and self._next.seq == len(self.items) - 1
 
     def tick(self, now_ns: int) -> codec.MissionCount | codec.MissionItem | None:
         """Returns the messages to send now."""
@@ -160,7 +160,7 @@ class Upload:
             return None
         self._tries += 1
         self._due_ns = now_ns + RETRY_NS
-        return self._said
+        return self._next
 
 
 class Missions(_Guide):
@@ -207,9 +207,9 @@ class Missions(_Guide):
             self._seen, self._sent, self._cut = way, left[:MOST_POINTS], len(left) > MOST_POINTS
             self._due_ns = now_ns + _NEXT_NS
             upload = self._upload = Upload(self._items(position))
-        said = upload.tick(now_ns)
+        message = upload.tick(now_ns)
         if not upload.accepted and not upload.why:
-            return [] if said is None else [said]
+            return [] if message is None else [message]
         self._upload = None
         if upload.accepted:
             self._accepted = True

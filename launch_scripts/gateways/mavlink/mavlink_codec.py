@@ -195,7 +195,7 @@ class Wire:
         left = self._mav.buf[self._mav.buf_index :]
         self._mav.buf = bytearray() if whole or len(left) > _LONGEST_REST else left
         self._mav.buf_index = 0
-        return [heard for each in found if self._is_vehicles(each) and (heard := _read(each)) is not None]
+        return [checked for each in found if self._is_vehicles(each) and (checked := _read(each)) is not None]
 
     def _is_vehicles(self, message: Any) -> bool:
         sysid = message.get_srcSystem()
@@ -253,8 +253,8 @@ def _read(message: Any) -> Incoming | None:
             return CommandAnswered(message.command, message.result)
         case "STATUSTEXT" if message.severity <= common.MAV_SEVERITY_WARNING:
             text = message.text if isinstance(message.text, str) else message.text.decode("ascii", "replace")
-            shown = "".join(letter for letter in text if " " <= letter <= "~").strip()
-            return Warned(shown) if shown else None
+            printable = "".join(letter for letter in text if " " <= letter <= "~").strip()
+            return Warned(printable) if printable else None
     return None
 
 

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from pathlib import Path
 
 from launch_scripts.gateways.mavlink.adapter import Action, Adapter, Follow, Report, Unfollow, Withdraw
-from launch_scripts.gateways.mavlink.guidance import Wishes
+from launch_scripts.gateways.mavlink.guidance import Options
 from launch_scripts.gateways.mavlink.link import Address, StreamLink, UdpLink, open_link
 from launch_scripts.gateways.mavlink.mavlink_codec import Wire
 from launch_scripts.stop_requests import stop_requests
@@ -46,18 +46,18 @@ def check_ground(frame: Frame) -> None:
 def run(
     connect: Callable[[], Swarm],
     address: Address,
-    wishes: Wishes,
+    options: Options,
     *,
     sysid: int | None,
     key: bytes | None,
-    tell: Callable[[str], None],
+    say: Callable[[str], None],
 ) -> None:
     """Until SIGINT or SIGTERM. Raises SwarmError if the swarm or the link cannot be reached, or the run is over."""
     with connect() as swarm:
         check_ground(swarm.frame)
         with contextlib.closing(open_link(address)) as link:
-            shell = Shell(swarm, link, Wire(sysid, key, time.time()), wishes, tell)
-            tell(f"waiting for a vehicle at {address}; Ctrl-C ends it")
+            shell = Shell(swarm, link, Wire(sysid, key, time.time()), options, say)
+            say(f"waiting for a vehicle at {address}; Ctrl-C ends it")
             with stop_requests() as stopping:
                 try:
                     with contextlib.suppress(KeyboardInterrupt):
@@ -75,16 +75,16 @@ class Shell:
         swarm: Swarm,
         link: UdpLink | StreamLink,
         wire: Wire,
-        wishes: Wishes,
-        tell: Callable[[str], None],
+        options: Options,
+        say: Callable[[str], None],
         now_ns: Callable[[], int] = time.monotonic_ns,
     ) -> None:
-        self._swarm, self._link, self._wire, self._wishes = swarm, link, wire, wishes
-        self._tell, self._now_ns = tell, now_ns
-        self._adapter = Adapter(swarm.frame, wishes)
+        self._swarm, self._link, self._wire, self._options = swarm, link, wire, options
+        self._say, self._now_ns = say, now_ns
+        self._adapter = Adapter(swarm.frame, options)
         self._vehicle: Vehicle | None = None
         self._routes: Stream[Route] | None = None
-        swarm.on_problem(tell)
+        swarm.on_problem(say)
 
     def turn(self) -> None:
         """Reads input, and performs due actions."""
@@ -94,10 +94,10 @@ class Shell:
             if data is None:
                 break
             within_s = 0.0
-            heard = self._wire.read(data, whole=self._link.whole)
-            if heard:
+            messages = self._wire.read(data, whole=self._link.whole)
+            if messages:
                 self._link.answer_last()
-            for message in heard:
+            for message in messages:
                 self._adapter.on_message(message, self._now_ns())
         else:
             time.sleep(_TURN_S / 4)
@@ -124,13 +124,13 @@ class Shell:
     def _perform(self, action: Action) -> None:
         match action:
             case str():
-                self._tell(action)
+                self._say(action)
             case Report(x_m=x_m, y_m=y_m, heading_rad=heading_rad, speed_m_per_s=speed_m_per_s):
                 if self._vehicle is None:
-                    wishes = self._wishes
+                    options = self._options
                     self._vehicle = self._swarm.vehicle(
-                        wishes.id or f"mav{self._wire.vehicle}",
-                        group=wishes.group, radius_m=wishes.radius_m, vehicle_class=wishes.vehicle_class,
+                        options.id or f"mav{self._wire.vehicle}",
+                        group=options.group, radius_m=options.radius_m, vehicle_class=options.vehicle_class,
                     )  # fmt: skip
                 self._vehicle.at(x_m, y_m, heading_rad=heading_rad, speed_m_per_s=speed_m_per_s)
             case Withdraw():

@@ -286,9 +286,9 @@ def load_settings(path: Path | None, options: Mapping[str, object] | None = None
 def parse_settings(text: str, source: str = "settings", options: Mapping[str, object] | None = None) -> Settings:
     """Like `load_settings`, from a text."""
     raw = parse_toml(text, source, ConfigError)
-    said = {key: value for key, value in (options or {}).items() if value is not None}
-    raw = with_settings(raw, said, source)
-    source += " with options" if said else ""
+    given = {key: value for key, value in (options or {}).items() if value is not None}
+    raw = with_settings(raw, given, source)
+    source += " with options" if given else ""
     settings = converted(raw, Settings, source)
     for fault in _faults(settings):
         raise ConfigError(f"{source}: {fault}")

@@ -493,9 +493,9 @@ class Incoming:
                 reply(self._node.types.make(row.type_name + RESPONSE, success=done, message=sentence))
 
             def give() -> None:
-                told = orders.resume() if row.name == "resume" else orders.pause()
-                silent = f", no reply from: {', '.join(told.silent)}" if told.silent else ""
-                respond(True, f"obeyed by {number_of(len(told.obeyed), 'process')}{silent}")
+                reply = orders.resume() if row.name == "resume" else orders.pause()
+                silent = f", no reply from: {', '.join(reply.silent)}" if reply.silent else ""
+                respond(True, f"obeyed by {number_of(len(reply.obeyed), 'process')}{silent}")
 
             if not self._orders.give(row.topic, give, lambda why: respond(False, why)):
                 respond(False, "too many orders wait already")

@@ -82,7 +82,7 @@ class _Now(NamedTuple):
     health: Health
 
 
-_Told = Iterator[tuple[str | None, Any]]
+_Messages = Iterator[tuple[str | None, Any]]
 """Messages of a row, each with the name in ROS of its vehicle or target; None if there is one for all."""
 
 
@@ -120,12 +120,12 @@ class Moving:
         if since_s > 0:
             east_m, north_m = seen.x_m - x_m, seen.y_m - y_m
             forward_m = math.hypot(east_m, north_m)
-            turned_rad = 0.0
+            turn_rad = 0.0
             if heading_rad is not None:
                 forward_m = east_m * math.sin(heading_rad) + north_m * math.cos(heading_rad)
                 if before_rad is not None:
-                    turned_rad = (heading_rad - before_rad + math.pi) % math.tau - math.pi
-            self.twist = (forward_m / since_s, turned_rad / since_s)
+                    turn_rad = (heading_rad - before_rad + math.pi) % math.tau - math.pi
+            self.twist = (forward_m / since_s, turn_rad / since_s)
         self.place, self._moved_ns = (seen.x_m, seen.y_m, heading_rad), now_ns
 
 
@@ -164,17 +164,17 @@ class Gateway:
         self.channels = self._channels_now()
         """The topics that are to be up, each a publisher with its token."""
         pose = ros_messages.packed_pose(messages)
-        self._tellers: dict[str, Callable[[_Now], _Told]] = {
-            "map": self._tell_map, "map_updates": self._tell_updates, "tf_static": self._tell_static,
-            "tf": self._tell_transforms,
-            "odom": self._tell_each(lambda each, at_ns: each.odometry.at(at_ns, [each.place], each.twist)),
-            "pose": self._tell_each(lambda each, at_ns: pose.at(at_ns, [each.place])),
-            "plan": self._tell_plans,
-            "fix": self._tell_each(
+        self._makers: dict[str, Callable[[_Now], _Messages]] = {
+            "map": self._make_map, "map_updates": self._make_updates, "tf_static": self._make_static,
+            "tf": self._make_transforms,
+            "odom": self._make_each(lambda each, at_ns: each.odometry.at(at_ns, [each.place], each.twist)),
+            "pose": self._make_each(lambda each, at_ns: pose.at(at_ns, [each.place])),
+            "plan": self._make_plans,
+            "fix": self._make_each(
                 lambda each, at_ns: to_wgs84 and messages.fix(at_ns, each.frames[1], *to_wgs84(*each.place[:2]))
             ),
-            "poses": self._tell_all_poses, "targets": self._tell_targets, "target_pose": self._tell_target_poses,
-            "markers": self._tell_markers, "diagnostics": self._tell_diagnostics,
+            "poses": self._make_all_poses, "targets": self._make_targets, "target_pose": self._make_target_poses,
+            "markers": self._make_markers, "diagnostics": self._make_diagnostics,
         }  # fmt: skip
 
     def whole_map(self, stamp_ns: int) -> Any:
@@ -214,10 +214,10 @@ class Gateway:
             if "map_updates" in self._rows:
                 self._changed = merged(changed, self._changed)
         puts: list[Put] = []
-        for name, tell in self._tellers.items():
+        for name, make in self._makers.items():
             if name in due:
                 self._due_ns[name] = _next_ns(self._rows[name], now_ns)
-                puts += [Put(self._channel(name, of), message) for of, message in tell(now)]
+                puts += [Put(self._channel(name, of), message) for of, message in make(now)]
         return puts
 
     # --- who is there ---------------------------------------------------------------------------------------------
@@ -271,42 +271,42 @@ class Gateway:
 
     # --- vehicles -------------------------------------------------------------------------------------------------
 
-    def _tell_each(self, message: Callable[[Moving, int], Any]) -> Callable[[_Now], _Told]:
-        """Makes the teller of a topic that every vehicle has, from its message at a stamp."""
+    def _make_each(self, message: Callable[[Moving, int], Any]) -> Callable[[_Now], _Messages]:
+        """Returns the maker of a topic that every vehicle has, from its message at a stamp."""
         return lambda now: ((name, message(each, now.stamp_ns)) for name, each in self._vehicles.items())
 
-    def _tell_plans(self, now: _Now) -> _Told:
+    def _make_plans(self, now: _Now) -> _Messages:
         for name, each in self._vehicles.items():
             if each.route_is_new:
                 each.route_is_new = False
                 yield name, self._messages.path(now.stamp_ns, each.route)
 
-    def _groups(self) -> _Told:
+    def _groups(self) -> _Messages:
         """Vehicles whose transforms go into one message, with the name of the one that has a topic of its own."""
         if self._bare:
             yield from ((name, [each]) for name, each in self._vehicles.items())
         elif self._vehicles:
             yield None, list(self._vehicles.values())
 
-    def _tell_transforms(self, now: _Now) -> _Told:
+    def _make_transforms(self, now: _Now) -> _Messages:
         for name, group in self._groups():
             if name not in self._transforms:
                 frames = [each.frames for each in group]
                 self._transforms[name] = ros_messages.packed_transforms(self._messages, frames)
             yield name, self._transforms[name].at(now.stamp_ns, [each.place for each in group])
 
-    def _tell_static(self, now: _Now) -> _Told:
+    def _make_static(self, now: _Now) -> _Messages:
         """The frames that do not move lie in the map's origin."""
         changed, self._crew_changed = self._crew_changed, False
         for name, group in self._groups() if changed else ():
             pairs = [(self._messages.map.frame, each.frames[0]) for each in group]
-            told = [self._messages.transform(now.stamp_ns, pair) for pair in pairs]
-            yield name, self._messages.transforms(told)
+            transforms = [self._messages.transform(now.stamp_ns, pair) for pair in pairs]
+            yield name, self._messages.transforms(transforms)
 
-    def _tell_all_poses(self, now: _Now) -> _Told:
-        told = sorted(self._vehicles.values(), key=lambda each: each.id)
-        points_m = np.array([each.place[:2] for each in told], np.float64).reshape(-1, 2)
-        yield None, self._messages.pose_array(now.stamp_ns, points_m, [each.place[2] for each in told])
+    def _make_all_poses(self, now: _Now) -> _Messages:
+        vehicles = sorted(self._vehicles.values(), key=lambda each: each.id)
+        points_m = np.array([each.place[:2] for each in vehicles], np.float64).reshape(-1, 2)
+        yield None, self._messages.pose_array(now.stamp_ns, points_m, [each.place[2] for each in vehicles])
 
     # --- targets. An untracked target may be anywhere: it is published again when a tracker returns ---------------
 
@@ -315,29 +315,29 @@ class Gateway:
         seen = now.targets
         return {name: seen[id] for name, id in self._targets.items() if id in seen and not seen[id].lost}
 
-    def _tell_target_poses(self, now: _Now) -> _Told:
+    def _make_target_poses(self, now: _Now) -> _Messages:
         for name, each in self._tracked(now).items():
             yield name, self._messages.pose_stamped(now.stamp_ns, each.x_m, each.y_m)
 
-    def _tell_targets(self, now: _Now) -> _Told:
+    def _make_targets(self, now: _Now) -> _Messages:
         tracked = sorted(self._tracked(now).values(), key=lambda each: each.id)
         places = np.array([(each.x_m, each.y_m) for each in tracked], np.float64).reshape(-1, 2)
         yield None, self._messages.pose_array(now.stamp_ns, places)
 
     # --- the map --------------------------------------------------------------------------------------------------
 
-    def _tell_map(self, now: _Now) -> _Told:
+    def _make_map(self, now: _Now) -> _Messages:
         if self._feed.whole_is_due(now.now_ns):
             self._changed = []
             yield None, self.whole_map(now.stamp_ns)
 
-    def _tell_updates(self, now: _Now) -> _Told:
+    def _make_updates(self, now: _Now) -> _Messages:
         changed, self._changed = self._changed, []
         for window in changed:
             cells = self._feed.occupancy(window)
             yield None, map_messages.occupancy_update(self._messages, now.stamp_ns, cells, window)
 
-    def _tell_markers(self, now: _Now) -> _Told:
+    def _make_markers(self, now: _Now) -> _Messages:
         grid, fresh = self._feed.grid, self._fresh
         self._fresh = []
         lethal, paced, zones = (cells[:MOST_CUBES].tolist() for cells in self._feed.marked)
@@ -350,8 +350,8 @@ class Gateway:
 
     # --- how all are ----------------------------------------------------------------------------------------------
 
-    def _tell_diagnostics(self, now: _Now) -> _Told:
-        """Publishes for vehicles, targets, map and gateway: whether each is well, a sentence, and values."""
+    def _make_diagnostics(self, now: _Now) -> _Messages:
+        """Yields for vehicles, targets, map and gateway: whether each is well, a sentence, and values."""
         states = Counter(each.state for each in now.vehicles.values())
         bad = ", ".join(f"{states[state]} {state}" for state in _BAD_STATES if states[state])
         lost = sorted(each.id for each in now.targets.values() if each.lost)
@@ -373,9 +373,9 @@ class Gateway:
              "both links are up" if health.up else "a link is down",
              {"run": health.run, **dict(sorted(health.counts.items()))}),
         )  # fmt: skip
-        told = [self._messages.diagnostic(f"swarm: {row[0]}", *row[1:]) for row in rows]
+        statuses = [self._messages.diagnostic(f"swarm: {row[0]}", *row[1:]) for row in rows]
         header = self._messages.header(now.stamp_ns, "")
-        yield None, self._messages.types.make("diagnostic_msgs/msg/DiagnosticArray", header=header, status=told)
+        yield None, self._messages.types.make("diagnostic_msgs/msg/DiagnosticArray", header=header, status=statuses)
 
 
 def _next_ns(row: TopicRow, now_ns: int) -> int:

@@ -171,7 +171,7 @@ _MEETS_AND_DOES = {
     Kind.SERVICE: (Kind.CLIENT, "serves"),
     Kind.CLIENT: (Kind.SERVICE, "asks"),
 }
-MOST_TOLD = 1000
+MOST_REPORTED = 1000
 """Limit of sentences, after which no more are reported."""
 
 
@@ -179,7 +179,7 @@ class PeerWatch:
     """Tells of each peer's fault once."""
 
     def __init__(self) -> None:
-        self._told: set[str] = set()
+        self._reported: set[str] = set()
 
     def sentences(self, seen: Endpoint, ours: Iterable[Endpoint]) -> list[str]:
         """Returns one sentence about the reason why a peer's endpoint does not match one of ours of the same name;
@@ -189,9 +189,9 @@ class PeerWatch:
         if not faults or None in faults:
             return []
         sentence = f"node {seen.node.name[:80]} {does} {seen.topic[:120]} {faults[0]}"
-        if sentence in self._told or len(self._told) >= MOST_TOLD:
+        if sentence in self._reported or len(self._reported) >= MOST_REPORTED:
             return []
-        self._told.add(sentence)
+        self._reported.add(sentence)
         return [sentence]
 
 

@@ -255,9 +255,9 @@ class RosMessages:
 
     def diagnostic(self, name: str, level: Level, message: str, values: Mapping[str, object]) -> Any:
         """diagnostic_msgs/DiagnosticStatus of one part of the swarm."""
-        told = [{"key": key, "value": str(value)} for key, value in values.items()]
+        pairs = [{"key": key, "value": str(value)} for key, value in values.items()]
         status = "diagnostic_msgs/msg/DiagnosticStatus"
-        return self.types.make(status, level=int(level), name=name, message=message, values=told)
+        return self.types.make(status, level=int(level), name=name, message=message, values=pairs)
 
     def log(self, stamp_ns: int, severity: Severity, name: str, text: str) -> Any:
         """rcl_interfaces/Log: a line of /rosout. The sender is `name`."""

@@ -272,7 +272,7 @@ class Input:
         self._waiting: deque[zenoh.Sample] = deque(maxlen=1)
         self._held: Any = None
         """Message for which the queue had no room."""
-        self._said: str | None = None
+        self._logged: str | None = None
         self.endpoint = node.listen(topic, row, self._waiting.append)
 
     def tick(self, now_ns: int) -> None:
@@ -298,13 +298,13 @@ class Input:
         """Says why a message is refused; what begins in the same way is said once, until one is not refused."""
         self.refused += 1
         kind = sentence.partition(" is ")[0]
-        if kind != self._said:
-            self._said = kind
+        if kind != self._logged:
+            self._logged = kind
             log.warning("topic %s: %s", self.endpoint.topic, sentence)
 
     def _try(self, message: Any, now_ns: int) -> None:
         self._take(message, now_ns)
-        self._said = None
+        self._logged = None
 
 
 # --- the session --------------------------------------------------------------------------------------------------

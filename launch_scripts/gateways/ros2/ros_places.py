@@ -141,22 +141,22 @@ class RobotTrack:
     def __init__(self, reader: FrameReader, lease_s: float) -> None:
         self.place: Place | None = None
         self._reader, self._lease_s = reader, lease_s
-        self._heard_ns = 0
+        self._received_ns = 0
 
     def on_reading(self, message: Any, now_ns: int) -> Place:
         """Takes in where it is. Without a twist its speed is what two poses tell. Raises ConfigError."""
-        found, before, since_ns = robot_place(self._reader, message), self.place, now_ns - self._heard_ns
+        found, before, since_ns = robot_place(self._reader, message), self.place, now_ns - self._received_ns
         if before is not None and not hasattr(message, "twist") and _LEAST_GAP_NS <= since_ns <= _MOST_GAP_NS:
             east_m, north_m = found.x_m - before.x_m, found.y_m - before.y_m
             speed = math.hypot(east_m, north_m) * NS_PER_S / since_ns
             if _STANDS_M_PER_S <= speed <= MOST_M_PER_S:  # or it stands, or was put somewhere else
                 found = Place(found.x_m, found.y_m, math.atan2(east_m, north_m) % math.tau, speed)
-        self.place, self._heard_ns = found, now_ns
+        self.place, self._received_ns = found, now_ns
         return found
 
     def gone(self, now_ns: int) -> bool:
         """True if its lease has ended. Said once: it may come back."""
-        if self.place is None or now_ns - self._heard_ns <= self._lease_s * NS_PER_S:
+        if self.place is None or now_ns - self._received_ns <= self._lease_s * NS_PER_S:
             return False
         self.place = None
         return True
@@ -222,7 +222,7 @@ def _between(values: NDArray[np.float64], borders: NDArray[np.float64]) -> NDArr
 
 def _check_grid(map: RosMap, message: Any) -> None:
     info, frame, many = message.info, message.header.frame_id.strip("/"), len(message.data)
-    at, turned = info.origin.position, info.origin.orientation
+    at, rotation = info.origin.position, info.origin.orientation
     fault = None
     if frame != map.frame:
         fault = f"frame is {frame[:80]!r}, expected {map.frame!r}"
@@ -232,7 +232,7 @@ def _check_grid(map: RosMap, message: Any) -> None:
         fault = f"resolution is {float(info.resolution)!r} m, expected at least {_LEAST_SIDE_M:g}"
     elif not (abs(at.x) <= 1e9 and abs(at.y) <= 1e9):
         fault = f"origin is ({at.x!r}, {at.y!r}), expected numbers of metres"
-    elif not all(abs(each) < 1e-6 for each in (turned.x, turned.y, turned.z)):
+    elif not all(abs(each) < 1e-6 for each in (rotation.x, rotation.y, rotation.z)):
         fault = "grid is turned, expected an origin whose orientation is (0, 0, 0, 1)"
     if fault is not None:
         raise ConfigError(fault)

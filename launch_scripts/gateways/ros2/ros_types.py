@@ -48,8 +48,8 @@ class RosTypes:
                 self._store.register({name: get_types_from_msg(text, as_message)[as_message]})
         if _EVENT_INFO in self._store.fielddefs:  # but in Humble, which hashes nothing
             constants, fields = self._store.fielddefs[_EVENT_INFO]
-            told = [(field, _GID if field == "client_gid" else kind) for field, kind in fields]
-            self._store.fielddefs[_EVENT_INFO] = (constants, told)
+            adapted = [(field, _GID if field == "client_gid" else kind) for field, kind in fields]
+            self._store.fielddefs[_EVENT_INFO] = (constants, adapted)
             for name in _ADDED:
                 if name.endswith(RESPONSE):
                     self._link_service(name.removesuffix(RESPONSE))

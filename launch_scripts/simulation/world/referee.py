@@ -221,9 +221,9 @@ class Referee:
         yield from self._obstacles.check(stay)
         for other, until_ns in _meetings(stay, self._stays[stay.cell], self._encounters, _SKEW_NS):
             first, second = sorted((stay, other), key=lambda each: each.who)
-            evidence, said = (replace(first), replace(second)), f"{first.who} and {second.who} on one cell"
+            evidence, text = (replace(first), replace(second)), f"{first.who} and {second.who} on one cell"
             on = self._grid.terrain_cell(stay.cell)
-            yield Broken("collisions", f"{first.who} {second.who}", on, until_ns, said, evidence)
+            yield Broken("collisions", f"{first.who} {second.who}", on, until_ns, text, evidence)
 
     def _sweep(self, now_ns: int) -> None:
         """Forgets stays that ended long ago. A vehicle's last stay is kept: it still stands there."""

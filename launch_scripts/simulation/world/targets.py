@@ -46,8 +46,8 @@ STAY_COOL_DOWN_NS = 5 * NS_PER_S
 """The same of a target that stays where it was caught. Chosen, not measured."""
 TRACKER = "targets"
 """The name under which this process and its standbys tell poses: a later generation takes over at once."""
-_WAYS_PER_TICK = 1
-"""Ways of all targets that are computed in one tick: bounds its time."""
+_PATHS_PER_TICK = 1
+"""Paths of all targets that are computed in one tick: bounds its time."""
 _MOST_COUNTED = 1 << 32
 """Captures and jumps that another process may have counted: more is a lie, and leaves no room to count on."""
 
@@ -272,7 +272,7 @@ class TargetWorld:
         elapsed_s = min((now_ns - self._ticked_ns) / NS_PER_S, LONGEST_TICK_S) * time_scale
         self._ticked_ns = now_ns
         waited_ns = now_ns - self._started_ns
-        self._budget.ways = _WAYS_PER_TICK
+        self._budget.paths = _PATHS_PER_TICK
         actions: list[Action] = [*self._rovers.tick(time_scale, now_ns)]
         for id, target in self._targets.items():
             patience_ns = 0 if target.unheard_of else PATIENCE_NS if id in planned else LISTEN_NS

@@ -29,9 +29,9 @@ if TYPE_CHECKING:
     from scipy.sparse import csr_array
 
 WAY_HALF_CELLS = 96
-"""Waypoints lie in a window which reaches this far to every side: bounds the time to compute a way."""
+"""Waypoints lie in a window which reaches this far to every side: bounds the time to compute a path."""
 WAY_MODULES = ("scipy.sparse.csgraph",)
-"""Modules that ways are computed with. They take 0.2 s, for which the start of all other processes would wait."""
+"""Modules that paths are computed with. They take 0.2 s, for which the start of all other processes would wait."""
 _TURN_SHARE = 1 / 20
 """Chance of a new heading at each step: 20 cells straight on in the mean, so that a walk leaves the place where it
 began."""
@@ -178,13 +178,13 @@ class TrueTerrain:
 
 @dataclass
 class Budget:
-    """Number of ways that may still be computed in this tick. Other walkers wait for the next."""
+    """Number of paths that may still be computed in this tick. Other walkers wait for the next."""
 
-    ways: float = math.inf
+    paths: float = math.inf
 
     def take(self) -> bool:
-        self.ways -= 1
-        return self.ways >= 0
+        self.paths -= 1
+        return self.paths >= 0
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -194,7 +194,7 @@ class WalkWorld:
     target   its id
     terrain  the true pace, and the steps that are possible
     chance   numbers that follow from the run's seed and the target's id
-    budget   how many ways may still be computed now, by all walks together
+    budget   how many paths may still be computed now, by all walks together
     """
 
     target: str
@@ -297,11 +297,11 @@ WALKS: Mapping[str, Callable[[WalkWorld], Walk]] = {
 """The built-in walks. The motion of an external target belongs to another process."""
 
 
-def walk_of(plugin: Plugin, world: WalkWorld, tell: Tell) -> Walk:
-    """The walk that a scenario names. Raises ConfigError if it cannot be made; `tell` takes its later fault."""
+def walk_of(plugin: Plugin, world: WalkWorld, report: Tell) -> Walk:
+    """The walk that a scenario names. Raises ConfigError if it cannot be made; `report` takes its later fault."""
     if plugin.factory is None:
         return WALKS[plugin.named.name](world)
-    return PluginWalk(plugin.make(world), world.terrain, Guard(plugin, tell))
+    return PluginWalk(plugin.make(world), world.terrain, Guard(plugin, report))
 
 
 class PluginWalk:

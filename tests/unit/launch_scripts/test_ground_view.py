@@ -40,7 +40,7 @@ from launch_scripts.monitor.ground_view import (
     title_places,
 )
 from launch_scripts.monitor.live_layout import COST, PHOTO
-from launch_scripts.monitor.rerun_outputs import Pen, in_markdown, shown
+from launch_scripts.monitor.rerun_outputs import Pen, in_markdown, inline
 from launch_scripts.monitor.terrain_mesh import Bytes, Floats, TerrainMesh
 from launch_scripts.observe import run_state as facts
 from launch_scripts.observe.palette import rgb
@@ -281,7 +281,7 @@ def test_a_mark_changes_the_photo_of_the_tiles_that_show_its_cell_and_of_no_othe
     ],
 )
 def test_a_strange_text_is_one_line_of_characters_that_every_viewer_has(text: str, line: str) -> None:
-    assert shown(text) == line
+    assert inline(text) == line
 
 
 def test_markdown_of_others_is_shown_and_not_read() -> None:
@@ -350,7 +350,7 @@ def test_a_planner_tells_the_mean_factor_of_a_class_until_its_prior_stands_again
 def test_everybody_who_shows_a_run_says_what_was_learned_and_nothing_while_nothing_is() -> None:
     recorder = Recorder(zoned(""), GROUND.grid)
     assert not any("learned" in line for line in facts.lines(recorder.summary(1)))
-    recorder.heard(stats("planner", "t", gauges={"learned.grass": 2.853}), 1)
+    recorder.on_message(stats("planner", "t", gauges={"learned.grass": 2.853}), 1)
     assert "learned grass x 2.9" in facts.lines(recorder.summary(1))
     assert facts.for_report(recorder.summary(1))["learned"] == {"grass": 2.853}
 
@@ -359,7 +359,7 @@ def test_a_report_tells_each_kind_of_ground_and_has_a_picture(tmp_path: Path) ->
     _, sets = learned(flat=3.0, steep=1.0)
     recorder = Recorder(zoned(""), GROUND.grid)
     for each in sets:
-        recorder.heard(each, 1)
+        recorder.on_message(each, 1)
     write_report(tmp_path, make_report(recorder, GROUND), recorder, GROUND)
     flat, steep = json.loads((tmp_path / "report.json").read_text())["learned_kinds"]
     assert (flat["kind"], flat["cells"], flat["authors"]) == ("unknown 0-5", 400, 1)
@@ -381,19 +381,19 @@ def costs_to(pace: Floats, row: int, col: int) -> Floats:
 
 @given(st.integers(1, 3000), st.integers(1, 3000), st.lists(st.sampled_from(["t0", "t1", "t2", "t3"]), max_size=20))
 def test_few_cells_are_asked_about_the_shown_target_most_and_all_others_in_turn(
-    rows: int, cols: int, heard: list[str]
+    rows: int, cols: int, planned: list[str]
 ) -> None:
     samples = CostSamples(GridSpec(rows, cols, 10.0), "t1")
     cells = np.array(samples.request.cells)
     assert 0 < len(cells) <= 64 * 64
     assert cells.min() >= 0
     assert cells.max() < rows * cols
-    samples.targets.extend(dict.fromkeys(heard))
+    samples.targets.extend(dict.fromkeys(planned))
     asked = [samples.next_target() for _ in range(16)]
-    if not heard:
+    if not planned:
         assert asked == [None] * 16
         return
-    counts = {target: asked.count(target) for target in set(heard)}
+    counts = {target: asked.count(target) for target in set(planned)}
     assert sum(counts.values()) == 16
     others = [count for target, count in counts.items() if target != "t1"]
     if "t1" in counts and others:

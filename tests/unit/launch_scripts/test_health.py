@@ -22,7 +22,7 @@ from support.processes import eventually
 
 from launch_scripts.launcher import local_processes
 from launch_scripts.launcher.local_processes import (
-    LOOK_EVERY_S,
+    CHECK_EVERY_S,
     STILL_S,
     Ending,
     LocalSwarm,
@@ -113,7 +113,7 @@ def test_a_probe_is_told_what_is_missing_and_exits_by_it(
     health.turned([])
     assert fast([*words, "--json"]) == 0
     assert json.loads(capsys.readouterr().out.partition("vehicles\n")[2])["status"] == "ready"
-    assert ask(f"{server.url}/healthz", live=False).told["status"] == "healthy", "a path is asked as it is"
+    assert ask(f"{server.url}/healthz", live=False).page["status"] == "healthy", "a path is asked as it is"
 
 
 def test_a_probe_says_what_it_could_not_reach(server: Server, capsys: pytest.CaptureFixture[str]) -> None:
@@ -293,21 +293,21 @@ def test_a_port_or_address_that_cannot_be_had_is_named(server: Server) -> None:
 
 
 class Machine:
-    """A process with a main thread, as a launcher sees it at each look, and what holds its judgement."""
+    """A process with a main thread, as a launcher sees it at each check, and what holds its judgement."""
 
     def __init__(self) -> None:
         self.stillness, self.stamp_ns, self.used_s = Stillness(), 1, 0.0
         self.had_s = self.slept_s = 0.0
         """Since its last tick: what it had of a processor, and what it slept while it could have had one."""
 
-    def look(self, passed_s: float, used: float, runnable: bool, idle: bool, ticks: bool) -> bool:
+    def check(self, passed_s: float, used: float, runnable: bool, idle: bool, ticks: bool) -> bool:
         """Returns whether it is said to hang. `used`: the share of the time for which it had a processor."""
         used_s = used * passed_s
         self.used_s, self.stamp_ns = self.used_s + used_s, self.stamp_ns + ticks
         self.had_s, self.slept_s = (
             (0.0, 0.0) if ticks else (self.had_s + used_s, self.slept_s + (not runnable) * (passed_s - used_s))
         )
-        return self.stillness.needs_look(self.stamp_ns) and self.stillness.hangs(
+        return self.stillness.needs_check(self.stamp_ns) and self.stillness.hangs(
             Sight(self.used_s, runnable), passed_s, idle
         )
 
@@ -317,11 +317,11 @@ _looks = st.tuples(st.floats(1.0, 90.0), st.floats(0.0, 1.0), st.booleans(), st.
 
 @given(st.lists(_looks, max_size=60))
 def test_who_is_said_to_hang_had_a_minute_of_a_processor_or_slept_it_away(
-    looks: list[tuple[float, float, bool, bool, bool]],
+    checks: list[tuple[float, float, bool, bool, bool]],
 ) -> None:
     machine = Machine()
-    for look in looks:
-        if machine.look(*look):
+    for check in checks:
+        if machine.check(*check):
             assert machine.had_s + machine.slept_s >= STILL_S - 0.001
 
 
@@ -340,16 +340,16 @@ def test_when_a_process_that_does_not_tick_is_said_to_hang(
     used: float, runnable: bool, idle: bool, hangs_after: int | None
 ) -> None:
     machine = Machine()
-    machine.look(1.0, used, runnable, idle, True)
-    found = (n for n in range(1, 700) if machine.look(1.0, used, runnable, idle, False))
+    machine.check(1.0, used, runnable, idle, True)
+    found = (n for n in range(1, 700) if machine.check(1.0, used, runnable, idle, False))
     after = next(found, None)
     assert after == hangs_after or (after is not None and hangs_after is not None and abs(after - hangs_after) <= 1)
 
 
 def test_who_was_stopped_with_its_launcher_does_not_hang_when_both_go_on() -> None:
     machine = Machine()
-    machine.look(1.0, 0.0, False, True, True)
-    assert not any(machine.look(3600.0, 0.0, False, True, False) for _ in range(30))
+    machine.check(1.0, 0.0, False, True, True)
+    assert not any(machine.check(3600.0, 0.0, False, True, False) for _ in range(30))
 
 
 @pytest.mark.parametrize("phase", [Phase.STARTS, Phase.ENDS, Phase.RUNS])
@@ -367,7 +367,7 @@ def test_who_hangs_says_where_and_is_killed_if_it_cannot_but_not_while_it_starts
     Board(running.health).write(Vitals(1, 0, phase, ()))
     for _ in range(70):
         swarm._end_hung()
-        now_s += LOOK_EVERY_S
+        now_s += CHECK_EVERY_S
     ended = [(61.0, signal.SIGABRT), *((s, signal.SIGKILL) for s in (67.0, 68.0, 69.0))]
     assert sent == (ended if phase is Phase.RUNS else [])
 

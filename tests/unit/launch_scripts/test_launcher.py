@@ -259,11 +259,11 @@ def test_an_added_process_that_refuses_ends_no_run(tmp_path: Path, swarms: list[
 
 
 def test_what_loads_kernels_for_a_launcher_that_is_gone_ends_without_a_word() -> None:
-    listens, tell = multiprocessing.Pipe(duplex=False)
-    listens.close()
-    _build(tell, None, tells=True)
+    receiver, sender = multiprocessing.Pipe(duplex=False)
+    receiver.close()
+    _build(sender, None, is_first=True)
     with pytest.raises(OSError, match="Broken pipe"):
-        tell.send(0)
+        sender.send(0)
 
 
 def test_builders_make_what_the_places_process_starts_with_before_what_saves_time(monkeypatch) -> None:
@@ -272,7 +272,7 @@ def test_builders_make_what_the_places_process_starts_with_before_what_saves_tim
     built: list[str] = []
     monkeypatch.setattr(kernel_build, "missing", list)
     monkeypatch.setattr(kernel_build, "build", lambda kernels, _: built.extend(map(name_of, kernels)))
-    _build(multiprocessing.Pipe()[1], Scenario(), tells=True)
+    _build(multiprocessing.Pipe()[1], Scenario(), is_first=True)
     needed, places = needed_kernels(Scenario()), place_kernels(Scenario())
     soon = set(map(name_of, (*needed.first, *places.first)))
     assert sorted(built) == sorted({*map(name_of, (*needed, *places))})

@@ -23,17 +23,17 @@ from support.mavlink_world import (
 from launch_scripts.gateways.mavlink import mavlink_codec as codec
 from launch_scripts.gateways.mavlink.adapter import Follow, Report, Unfollow, Withdraw
 from launch_scripts.gateways.mavlink.arming import ARDUPILOT, PX4
-from launch_scripts.gateways.mavlink.guidance import MOST_POINTS, Upload, Way, Wishes, rest, turns
+from launch_scripts.gateways.mavlink.guidance import MOST_POINTS, Options, Upload, Way, rest, turns
 
-MISSION, GUIDED = Wishes("t0"), Wishes("t0", "guided")
+MISSION, GUIDED = Options("t0"), Options("t0", "guided")
 OFFBOARD, AUTO_MISSION, AUTO_HOLD = 6 << 16, 4 << 16 | 4 << 24, 4 << 16 | 3 << 24
 
 
 def driving(
-    wishes: Wishes, vehicle: Autopilot | None = None, way: Way = WITH_A_TURN, seconds: float = 6.0
+    options: Options, vehicle: Autopilot | None = None, way: Way = WITH_A_TURN, seconds: float = 6.0
 ) -> World:
     """A vehicle that was found and has a route."""
-    world = World(wishes, vehicle)
+    world = World(options, vehicle)
     world.run(1.0)
     world.adapter.hear_way(way)
     world.run(seconds)
@@ -46,14 +46,14 @@ def places(items: list[codec.MissionItem]) -> list[int]:
 
 
 def of(world: World, kind: type) -> list[object]:
-    return [action for _, action in world.said if isinstance(action, kind)]
+    return [action for _, action in world.sent if isinstance(action, kind)]
 
 
 # --- in the swarm ------------------------------------------------------------------------------------------------
 
 
 def test_a_vehicle_is_reported_ten_times_a_second_where_it_says_that_it_is() -> None:
-    world = World(Wishes())
+    world = World(Options())
     reports = [each for each in world.run(3.0) if isinstance(each, Report)]
     assert 28 <= len(reports) <= 30
     assert FRAME.cell(reports[0].x_m, reports[0].y_m) == START
@@ -64,11 +64,11 @@ def test_a_vehicle_is_reported_ten_times_a_second_where_it_says_that_it_is() -> 
 def test_one_that_drives_stays_an_obstacle_when_its_link_is_lost_and_gets_its_target_back() -> None:
     world = driving(MISSION)
     world.speaks = False
-    said = world.run(8.0)
-    assert [type(each) for each in said if isinstance(each, Unfollow | Withdraw | Report)] == [Unfollow, Report]
-    (last,) = [each for each in said if isinstance(each, Report)]
+    sent = world.run(8.0)
+    assert [type(each) for each in sent if isinstance(each, Unfollow | Withdraw | Report)] == [Unfollow, Report]
+    (last,) = [each for each in sent if isinstance(each, Report)]
     assert last.heading_rad is None, "where to it went nobody knows"
-    assert "no heartbeat for 5 s: the vehicle is left to its own fail-safe" in world.told()
+    assert "no heartbeat for 5 s: the vehicle is left to its own fail-safe" in world.sentences()
     world.speaks = True
     assert [each for each in world.run(1.0) if isinstance(each, Follow)] == [Follow("t0")]
 
@@ -80,7 +80,7 @@ def test_a_vehicle_that_is_back_is_where_it_says_and_not_where_the_one_before_wa
         world.hear(world.vehicle.position())  # of one whose heartbeats are lost
         world.run(0.5)
     world.run(2.5)
-    assert "no heartbeat for 5 s: the vehicle is left to its own fail-safe" in world.told()
+    assert "no heartbeat for 5 s: the vehicle is left to its own fail-safe" in world.sentences()
     world.hear(world.vehicle.beat())
     assert not [each for each in world.run(0.5) if isinstance(each, Follow | Report)]
     world.hear(world.vehicle.position())
@@ -92,9 +92,9 @@ def test_outside_the_terrain_it_is_nowhere_for_the_swarm() -> None:
     world.speaks = False
     world.hear(world.vehicle.beat())
     world.hear(codec.Position(0.5, 0.5, 0.0, 0.0, None))
-    said = world.run(0.2)
-    assert [type(each) for each in said if isinstance(each, Unfollow | Withdraw | Report)] == [Unfollow, Withdraw]
-    assert "it is outside the terrain: the vehicle is left to its own fail-safe" in world.told()
+    sent = world.run(0.2)
+    assert [type(each) for each in sent if isinstance(each, Unfollow | Withdraw | Report)] == [Unfollow, Withdraw]
+    assert "it is outside the terrain: the vehicle is left to its own fail-safe" in world.sentences()
 
 
 def test_another_kind_under_the_same_number_is_not_heard() -> None:
@@ -103,7 +103,7 @@ def test_another_kind_under_the_same_number_is_not_heard() -> None:
     world.hear(codec.Beat(PX4, COPTER, True, OFFBOARD))
     world.run(1.0)
     assert world.adapter.kind.name == "ArduPilot"
-    assert "another kind of vehicle speaks under the same number: it is ignored" in world.told()
+    assert "another kind of vehicle speaks under the same number: it is ignored" in world.sentences()
 
 
 def test_a_vehicle_that_warns_without_end_fills_no_log() -> None:
@@ -112,7 +112,7 @@ def test_a_vehicle_that_warns_without_end_fills_no_log() -> None:
         world.hear(codec.Warned(f"number {number}"))
         if number % 4 == 0:
             world.tick()
-    assert sum("the vehicle says" in each for each in world.told()) < 20
+    assert sum("the vehicle says" in each for each in world.sentences()) < 20
 
 
 # --- missions ----------------------------------------------------------------------------------------------------
@@ -133,28 +133,28 @@ def test_a_mission_has_the_turns_of_the_route_and_home_before_them_for_ardupilot
 
 
 def test_what_flies_takes_off_first_and_stays_at_the_end() -> None:
-    wishes = Wishes("t0", altitude_m=60.0, above="terrain")
-    (mission,) = driving(wishes, Autopilot(type=PLANE)).vehicle.missions
+    options = Options("t0", altitude_m=60.0, above="terrain")
+    (mission,) = driving(options, Autopilot(type=PLANE)).vehicle.missions
     assert [item.command for item in mission] == [
         codec.NAV_WAYPOINT, codec.NAV_TAKEOFF, codec.NAV_WAYPOINT, codec.NAV_WAYPOINT, codec.NAV_LOITER_UNLIM,
     ]  # fmt: skip
     assert {(item.frame, item.height_m) for item in mission} == {(codec.ABOVE_TERRAIN, 60.0)}
-    (mission,) = driving(wishes, Autopilot(type=COPTER, height_m=50.0)).vehicle.missions
+    (mission,) = driving(options, Autopilot(type=COPTER, height_m=50.0)).vehicle.missions
     assert codec.NAV_TAKEOFF not in [item.command for item in mission]
 
 
 @pytest.mark.parametrize(
-    ("wishes", "vehicle", "why"),
+    ("options", "vehicle", "why"),
     [
         (MISSION, Autopilot(PX4, COPTER), "it flies without an altitude: give --altitude M"),
-        (Wishes("t0", altitude_m=9.0, above="terrain"), Autopilot(PX4, COPTER), "takes no heights above terrain"),
-        (Wishes("t0", "guided", altitude_m=9.0), Autopilot(ARDUPILOT, PLANE), "ArduPilot has no guided mode here"),
+        (Options("t0", altitude_m=9.0, above="terrain"), Autopilot(PX4, COPTER), "takes no heights above terrain"),
+        (Options("t0", "guided", altitude_m=9.0), Autopilot(ARDUPILOT, PLANE), "ArduPilot has no guided mode here"),
         (GUIDED, Autopilot(0, 0), "has no guided mode here; give --drive mission"),
     ],
 )  # fmt: skip
-def test_what_cannot_be_driven_is_said_and_only_reported(wishes: Wishes, vehicle: Autopilot, why: str) -> None:
-    world = driving(wishes, vehicle)
-    assert any(why in each for each in world.told())
+def test_what_cannot_be_driven_is_said_and_only_reported(options: Options, vehicle: Autopilot, why: str) -> None:
+    world = driving(options, vehicle)
+    assert any(why in each for each in world.sentences())
     assert of(world, Report)
     assert not of(world, codec.MissionCount)
     assert not of(world, codec.Setpoint)
@@ -184,10 +184,10 @@ def test_a_long_route_is_uploaded_in_parts() -> None:
 def test_a_silent_vehicle_is_asked_five_times_and_then_told_of_again() -> None:
     vehicle = Autopilot(answers=False)
     world = driving(MISSION, vehicle, seconds=20.0)
-    times_s = [ns / 1e9 for ns, action in world.said if isinstance(action, codec.MissionCount)]
+    times_s = [ns / 1e9 for ns, action in world.sent if isinstance(action, codec.MissionCount)]
     assert [round(b - a, 1) for a, b in pairwise(times_s[:5])] == [1.5] * 4
     assert times_s[5] - times_s[4] >= 5.0
-    assert "a mission of 4 items has failed: the vehicle did not answer 5 times" in world.told()
+    assert "a mission of 4 items has failed: the vehicle did not answer 5 times" in world.sentences()
     vehicle.answers = True
     world.run(8.0)
     assert len(vehicle.missions) == 1
@@ -197,7 +197,7 @@ def test_a_refused_mission_says_the_result() -> None:
     world = driving(MISSION, Autopilot(answers=False), seconds=0.2)
     world.hear(codec.MissionAnswered(13))
     world.run(0.2)
-    assert "a mission of 4 items has failed: the vehicle refused it with MAV_MISSION_RESULT 13" in world.told()
+    assert "a mission of 4 items has failed: the vehicle refused it with MAV_MISSION_RESULT 13" in world.sentences()
 
 
 def test_items_are_asked_for_in_any_order_again_and_beyond_the_end() -> None:
@@ -238,7 +238,7 @@ def test_a_vehicle_that_asks_without_end_is_given_up() -> None:
     ],
 )
 def test_with_arm_it_is_armed_and_driven_as_its_make_asks(vehicle: Autopilot, steps: list[tuple[int, int]]) -> None:
-    driving(Wishes("t0", arm=True), vehicle, seconds=20.0)
+    driving(Options("t0", arm=True), vehicle, seconds=20.0)
     made = [
         (each.command, mode_of(each)) for each in vehicle.commands if each.command != codec.SET_MESSAGE_INTERVAL
     ]
@@ -254,24 +254,24 @@ def mode_of(command: codec.Command) -> int:
 def test_a_vehicle_that_refuses_to_be_armed_is_asked_ten_times() -> None:
     vehicle = Autopilot(PX4, answers=True)
     vehicle._obey = lambda command, params: 2  # type: ignore[method-assign]
-    world = driving(Wishes("t0", arm=True), vehicle, seconds=60.0)
+    world = driving(Options("t0", arm=True), vehicle, seconds=60.0)
     assert sum(each.command == codec.DO_SET_MODE for each in vehicle.commands) == 10
-    assert any("refuses to change its mode: MAV_RESULT 2" in each for each in world.told())
-    assert world.told()[-1].endswith("it has not obeyed 10 commands")
+    assert any("refuses to change its mode: MAV_RESULT 2" in each for each in world.sentences())
+    assert world.sentences()[-1].endswith("it has not obeyed 10 commands")
 
 
 def test_a_vehicle_that_knows_no_start_of_missions_is_told_three_times_and_left_in_peace() -> None:
     vehicle = Autopilot(0, 0)
     obey = vehicle._obey
     vehicle._obey = lambda command, params: 3 if command == codec.MISSION_START else obey(command, params)  # type: ignore[method-assign]
-    world = driving(Wishes("t0", arm=True), vehicle, seconds=60.0)
+    world = driving(Options("t0", arm=True), vehicle, seconds=60.0)
     assert [each.command for each in vehicle.commands].count(codec.MISSION_START) == 3
-    assert not any("left alone" in each for each in world.told())
+    assert not any("left alone" in each for each in world.sentences())
 
 
 def test_when_the_swarm_is_lost_the_vehicle_holds_and_goes_on_when_it_is_back() -> None:
     vehicle = Autopilot(PX4)
-    world = driving(Wishes("t0", arm=True), vehicle, seconds=10.0)
+    world = driving(Options("t0", arm=True), vehicle, seconds=10.0)
     world.adapter.hear_swarm(False)
     world.run(3.0)
     assert vehicle.mode == AUTO_HOLD
@@ -286,10 +286,10 @@ def test_when_the_swarm_is_lost_the_vehicle_holds_and_goes_on_when_it_is_back() 
 
 def test_px4_gets_setpoints_before_it_is_brought_into_offboard_and_none_when_the_swarm_is_lost() -> None:
     vehicle = Autopilot(PX4)
-    world = driving(Wishes("t0", "guided", arm=True), vehicle, seconds=8.0)
-    first = next(ns for ns, action in world.said if isinstance(action, codec.Setpoint))
+    world = driving(Options("t0", "guided", arm=True), vehicle, seconds=8.0)
+    first = next(ns for ns, action in world.sent if isinstance(action, codec.Setpoint))
     mode = next(
-        ns for ns, each in world.said if isinstance(each, codec.Command) and each.command == codec.DO_SET_MODE
+        ns for ns, each in world.sent if isinstance(each, codec.Command) and each.command == codec.DO_SET_MODE
     )
     assert 1.0 <= (mode - first) / 1e9 <= 1.2
     assert (vehicle.mode, vehicle.armed) == (OFFBOARD, True)
@@ -322,7 +322,7 @@ def test_what_was_steered_before_the_link_was_lost_is_not_held_when_it_is_back()
 
 def test_a_copter_in_guided_takes_off_once() -> None:
     vehicle = Autopilot(type=COPTER)
-    world = driving(Wishes("t0", "guided", arm=True, altitude_m=30.0), vehicle, seconds=10.0)
+    world = driving(Options("t0", "guided", arm=True, altitude_m=30.0), vehicle, seconds=10.0)
     takeoffs = [each for each in vehicle.commands if each.command == codec.NAV_TAKEOFF]
     assert [each.params[-1] for each in takeoffs] == [30.0]
     assert {each.height_m for each in of(world, codec.Setpoint)} == {30.0}  # type: ignore[attr-defined]

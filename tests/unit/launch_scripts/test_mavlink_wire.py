@@ -21,7 +21,7 @@ from support.mavlink_world import FRAME, GRID, START
 from support.swarm_model import SwarmModel
 
 from launch_scripts.gateways.mavlink import mavlink_codec as codec
-from launch_scripts.gateways.mavlink.guidance import Wishes
+from launch_scripts.gateways.mavlink.guidance import Options
 from launch_scripts.gateways.mavlink.link import StreamLink, UdpLink, open_link, read_address
 from launch_scripts.gateways.mavlink.mavlink_codec import Wire
 from launch_scripts.gateways.mavlink.service import Shell, check_ground, read_key
@@ -48,7 +48,7 @@ def read(door: codec.Wire, data: bytes) -> list[Any]:
 
 
 def test_what_a_vehicle_says_is_read_with_its_units() -> None:
-    said = Sender().bytes_of(
+    data = Sender().bytes_of(
         beat(),
         position(),
         position(hdg=65535),
@@ -61,7 +61,7 @@ def test_what_a_vehicle_says_is_read_with_its_units() -> None:
         common.MAVLink_attitude_message(1, 0, 0, 0, 0, 0, 0),
     )
     place = codec.Position(36.5, -84.1, 12.5, 5.0, math.pi / 2)
-    assert read(wire(), said) == [
+    assert read(wire(), data) == [
         codec.Beat(3, 10, True, 4), place, codec.Position(36.5, -84.1, 12.5, 5.0, None), codec.ItemAsked(3),
         codec.ItemAsked(4), codec.MissionAnswered(0), codec.CommandAnswered(codec.ARM_DISARM, 4),
         codec.Warned("PreArm: [2J no fix"),
@@ -102,12 +102,12 @@ def test_the_first_autopilot_is_the_vehicle_and_all_others_are_not_heard() -> No
 
 
 def test_messages_that_are_cut_anywhere_are_read_from_a_stream_and_not_from_datagrams() -> None:
-    said = Sender().bytes_of(beat(), position(), beat())
-    for cut in range(len(said)):
+    data = Sender().bytes_of(beat(), position(), beat())
+    for cut in range(len(data)):
         door = wire()
-        assert len([*door.read(said[:cut], whole=False), *door.read(said[cut:], whole=False)]) == 3
+        assert len([*door.read(data[:cut], whole=False), *door.read(data[cut:], whole=False)]) == 3
     door = wire()
-    assert len([*door.read(said[:30], whole=True), *door.read(said[30:], whole=True)]) < 3
+    assert len([*door.read(data[:30], whole=True), *door.read(data[30:], whole=True)]) < 3
 
 
 @settings(max_examples=few(300), deadline=None)
@@ -121,9 +121,9 @@ def test_any_bytes_pass_the_door_as_nothing_and_a_vehicle_is_heard_after_them(
         assert len(door._mav.buf) <= 512
     # The false begin of a message swallows up to 280 bytes that follow it.
     sender = Sender(key=key)
-    heard = [each for _ in range(40) for each in door.read(sender.bytes_of(beat()), whole=whole)]
-    assert heard
-    assert set(heard) == {codec.Beat(3, 10, True, 4)}
+    received = [each for _ in range(40) for each in door.read(sender.bytes_of(beat()), whole=whole)]
+    assert received
+    assert set(received) == {codec.Beat(3, 10, True, 4)}
 
 
 # --- signatures ---------------------------------------------------------------------------------------------------
@@ -148,9 +148,9 @@ def test_a_forged_signature_of_a_late_time_shuts_no_one_out() -> None:
 def test_what_we_say_is_signed() -> None:
     vehicle = common.MAVLink(None)
     vehicle.signing.secret_key, vehicle.signing.timestamp = KEY, int((NOW_S - 1_420_070_400) * 1e5)
-    (heard,) = vehicle.parse_buffer(wire(key=KEY).write(codec.Heartbeat()))
-    assert heard.get_type() == "HEARTBEAT"
-    assert heard._signed
+    (received,) = vehicle.parse_buffer(wire(key=KEY).write(codec.Heartbeat()))
+    assert received.get_type() == "HEARTBEAT"
+    assert received._signed
 
 
 def test_a_key_is_64_digits(tmp_path: Path) -> None:
@@ -163,9 +163,9 @@ def test_a_key_is_64_digits(tmp_path: Path) -> None:
 def test_a_signed_message_that_was_changed_on_its_way_is_not_heard(other: bytes, at: int, message: Any) -> None:
     door, sender = wire(key=KEY), Sender(key=KEY)
     read(door, sender.bytes_of(beat()))
-    said = sender.bytes_of(message)
-    changed = (said[:at] + other + said[at + len(other) :])[: len(said)]
-    assert len(read(door, changed)) == (changed == said)
+    data = sender.bytes_of(message)
+    changed = (data[:at] + other + data[at + len(other) :])[: len(data)]
+    assert len(read(door, changed)) == (changed == data)
 
 
 # --- out ----------------------------------------------------------------------------------------------------------
@@ -173,18 +173,18 @@ def test_a_signed_message_that_was_changed_on_its_way_is_not_heard(other: bytes,
 
 def test_what_is_said_to_a_vehicle_has_its_number_and_the_units_of_mavlink() -> None:
     door, vehicle = wire(9), common.MAVLink(None)
-    said = [
+    messages = [
         codec.Heartbeat(), codec.Command(codec.ARM_DISARM, (1,)), codec.MissionCount(2),
         codec.MissionItem(1, codec.NAV_WAYPOINT, codec.ABOVE_TERRAIN, 36.5, -84.1234567, 30.0, current=True),
         codec.MissionCurrent(1), codec.MissionCancelled(), codec.Setpoint(codec.ABOVE_HOME, 36.5, -84.1, None),
         codec.Setpoint(codec.ABOVE_HOME, 36.5, -84.1, 30.0),
     ]  # fmt: skip
-    heard = [vehicle.parse_buffer(door.write(message))[0] for message in said]
-    assert {(each.get_srcSystem(), each.get_srcComponent()) for each in heard} == {(codec.SYSID, codec.COMPID)}
-    assert [each._header.seq for each in heard] == list(range(8))
-    for each in heard[1:]:
+    received = [vehicle.parse_buffer(door.write(message))[0] for message in messages]
+    assert {(each.get_srcSystem(), each.get_srcComponent()) for each in received} == {(codec.SYSID, codec.COMPID)}
+    assert [each._header.seq for each in received] == list(range(8))
+    for each in received[1:]:
         assert (each.target_system, each.target_component) == (9, codec.AUTOPILOT)
-    first, command, count, item, current, cancelled, on_ground, in_air = heard
+    first, command, count, item, current, cancelled, on_ground, in_air = received
     assert (first.type, first.autopilot) == (18, 8)
     assert (command.command, command.param1, command.param7) == (codec.ARM_DISARM, 1.0, 0.0)
     assert (count.count, current.seq, cancelled.type) == (2, 1, 15)
@@ -348,12 +348,12 @@ class PlayedLink:
     def close(self) -> None:
         pass
 
-    def heard(self, kind: str) -> list[Any]:
+    def received(self, kind: str) -> list[Any]:
         return [each for each in self.written if each.get_type() == kind]
 
 
 class Rig:
-    def __init__(self, wishes: Wishes) -> None:
+    def __init__(self, options: Options) -> None:
         self.world = SwarmModel()
         self.obstacles: list[Obstacle] = []
         self.world.bus("ear").subscribe(OBSTACLE, self._hear)
@@ -361,13 +361,13 @@ class Rig:
         self.session = Session(bus, keeper_info(GRID), self.world.scheduler.clock)
         self.link = PlayedLink()
         self.now_ns = 10**12
-        self.told: list[str] = []
+        self.sentences: list[str] = []
         self.shell = Shell(
             Swarm(self.session),
             self.link,
             Wire(None, None, time.time()),
-            wishes,
-            self.told.append,
+            options,
+            self.sentences.append,
             lambda: self.now_ns,
         )
         self._vehicle = Sender(4)
@@ -379,8 +379,8 @@ class Rig:
 
     def vehicle_says(self, autopilot: int, type: int, mode: int = 0, base: int = 1) -> None:
         lat, lon = round(LAT_DEG * 1e7), round(LON_DEG * 1e7)
-        for said in (beat(autopilot, type, mode, base), position(lat, lon)):
-            self.link.pieces.append(self._vehicle.bytes_of(said))
+        for message in (beat(autopilot, type, mode, base), position(lat, lon)):
+            self.link.pieces.append(self._vehicle.bytes_of(message))
 
     def turns(self, seconds: float) -> None:
         for _ in range(round(seconds / 0.02)):
@@ -390,18 +390,18 @@ class Rig:
 
 
 def test_a_flood_of_strangers_delays_no_heartbeat_and_hides_no_vehicle() -> None:
-    rig = Rig(Wishes())
+    rig = Rig(Options())
     rig.vehicle_says(3, 10)
     rig.link.flood = Sender(9).bytes_of(common.MAVLink_attitude_message(0, 0, 0, 0, 0, 0, 0))
     rig.turns(2.2)
-    assert len(rig.link.heard("HEARTBEAT")) == 3
+    assert len(rig.link.received("HEARTBEAT")) == 3
     assert rig.obstacles[0].id == "mav4"
     assert FRAME.cell(rig.obstacles[0].x_m, rig.obstacles[0].y_m) == START
     assert rig.link.answered == 2, "who floods is not answered"
 
 
 def test_when_the_run_is_another_one_the_vehicle_is_put_on_hold_before_the_error_ends_it() -> None:
-    rig = Rig(Wishes("t0", arm=True, lost_s=60.0))
+    rig = Rig(Options("t0", arm=True, lost_s=60.0))
     mission = 4 << 16 | 4 << 24
     rig.vehicle_says(12, 10, mission, base=1 | 128)
     rig.turns(0.1)
@@ -412,7 +412,7 @@ def test_when_the_run_is_another_one_the_vehicle_is_put_on_hold_before_the_error
     with pytest.raises(RunMismatchError):
         rig.turns(1.0)
     rig.shell.stop()
-    holds = [(each.command, each.param2, each.param3) for each in rig.link.heard("COMMAND_LONG")]
+    holds = [(each.command, each.param2, each.param3) for each in rig.link.received("COMMAND_LONG")]
     assert holds[-3:] == [(176, 4.0, 3.0)] * 3, "nobody answers last words, so they are said three times"
 
 

@@ -17,12 +17,12 @@ from support.monitor_rig import hill
 from launch_scripts.check.scenario_check import network
 from launch_scripts.monitor import movers_view as view
 from launch_scripts.monitor.rerun_outputs import Pen, RateLimit, Strips
-from launch_scripts.monitor.styles import HUES, LOST_COLOUR, Looks
+from launch_scripts.monitor.styles import HUES, LOST_COLOUR, Colours
 from launch_scripts.monitor.terrain_mesh import TerrainMesh
 from launch_scripts.observe.alarms import KINDS, Alarm
 from launch_scripts.observe.latest_messages import LatestState, RunPlan, VehicleColumns
 from launch_scripts.observe.run_state import state_of
-from launch_scripts.plain_text import said_duration
+from launch_scripts.plain_text import format_duration
 from swarm.clock import NS_PER_S
 from swarm.config.scenario_files import parse_scenario
 from swarm.grid import GridSpec, walk
@@ -83,7 +83,7 @@ def test_the_colour_blind_tell_groups_and_targets_apart(who: str) -> None:
 
 def test_with_one_group_a_vehicle_has_its_targets_colour_and_with_several_its_groups() -> None:
     following = np.full(3, VehicleState.FOLLOWING, np.uint8)
-    one = Looks(["all"], ["t0", "t1"])
+    one = Colours(["all"], ["t0", "t1"])
     rows = np.array(one.rows(["t1", "t0", None]))
     assert one.vehicles(rows, following).tolist() == [
         list(one.target("t1")),
@@ -91,7 +91,7 @@ def test_with_one_group_a_vehicle_has_its_targets_colour_and_with_several_its_gr
         [170, 176, 182],
     ]
     assert one.target("t0") != one.target("t1")
-    two = Looks(["scouts", "trucks"], ["t0", "t1"])
+    two = Colours(["scouts", "trucks"], ["t0", "t1"])
     rows = np.array(two.rows(["scouts", "trucks", "strangers"]))
     assert len({tuple(colour) for colour in two.vehicles(rows, following).tolist()}) == 3
     assert two.target("t0") == two.target("t1")
@@ -100,7 +100,7 @@ def test_with_one_group_a_vehicle_has_its_targets_colour_and_with_several_its_gr
 
 @pytest.mark.parametrize("groups", [["all"], ["scouts", "trucks"], [f"g{n}" for n in range(30)]])
 def test_the_legend_explains_every_state_and_kind_once(groups: list[str]) -> None:
-    legend = Looks(groups, ["t0", "t1"]).legend()
+    legend = Colours(groups, ["t0", "t1"]).legend()
     meanings = [look.meaning for look in legend]
     assert len(meanings) == len(set(meanings)) <= 15
     said = " ".join(meanings)
@@ -317,7 +317,7 @@ def test_an_alarm_is_one_line_that_no_terminal_obeys_and_has_a_place_if_that_is_
 ) -> None:
     latest = LatestState(RunPlan((), (), 0, 0), GRID)
     told = WireAlarm(kind=kind, about=about, text=text, since_ns=3 * NS_PER_S, over_ns=90 * NS_PER_S, cell=cell)
-    latest.heard(stats(alarms=[told]), 2)
+    latest.on_message(stats(alarms=[told]), 2)
     [alarm] = state_of(latest, 3).alarms
     assert alarm.line.isprintable()
     if text.isprintable():
@@ -336,4 +336,4 @@ def test_no_message_says_since_and_a_number_of_seconds() -> None:
     texts = [path for path in files if path.suffix in (".py", ".js", ".j2", ".json", ".yml")]
     assert len(texts) > 300
     assert [path for path in texts if since.search(path.read_text(encoding="utf-8"))] == []
-    assert [said_duration(s) for s in (86, 1140, 19_200, 90_000)] == ["86 s", "19 min", "5 h 20 min", "1 d 1 h"]
+    assert [format_duration(s) for s in (86, 1140, 19_200, 90_000)] == ["86 s", "19 min", "5 h 20 min", "1 d 1 h"]

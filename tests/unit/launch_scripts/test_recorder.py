@@ -50,7 +50,7 @@ def recorder() -> Recorder:
 
 def hear(recorder: Recorder, *messages: Message, at_s: float = 0.0) -> None:
     for message in messages:
-        recorder.heard(message, int(at_s * NS_PER_S))
+        recorder.on_message(message, int(at_s * NS_PER_S))
 
 
 def stats(
@@ -165,7 +165,7 @@ def test_an_hour_of_kills_leaves_as_much_in_memory_as_minutes_of_them_and_no_cou
             marks.append(msgspec.structs.replace(gone, seq=gone.seq + 1))  # a keeper has compacted it
             marks.append(set_of(gone.author, 1, 1, {3: (MarkKind.LETHAL, 0.0, n - 1)}))  # and it comes late
             for message in (generation, late, fleet(author, {"a0-00": (n, 1.0)}, n, region=n % 2), *marks):
-                latest.heard(message, n * NS_PER_S)
+                latest.on_message(message, n * NS_PER_S)
             assert latest.vehicles().east_m.tolist() == [n]
             latest.started(Peer("agent", "a0", n))
             latest.alive(Peer("agent", "a0", n), True, n * NS_PER_S)
@@ -191,7 +191,7 @@ def test_made_up_names_take_a_bounded_memory_and_known_ones_are_heard(monkeypatc
             Heartbeat(role="planner", id=name, incarnation=1, ready=True, leads=True, seq=1),
             GoalStates(agent=name, stamp_ns=1, states=[goal]),
         ):  # fmt: skip
-            latest.heard(message, at_s * NS_PER_S)
+            latest.on_message(message, at_s * NS_PER_S)
         latest.alive(Peer("agent", name, 1), True, at_s * NS_PER_S)
 
     for n in range(40):

@@ -117,17 +117,17 @@ def test_the_swarm_is_told_valid_places_at_a_bounded_rate_whatever_comes(words: 
 
     node: Any = FakeNode(TYPES)
     poses = Input(node, "/uav/odom", replace(INCOMING["robot"], hz=hz), take)
-    now_ns, heard = 0, False
+    now_ns, received = 0, False
     for message, step_ns in words:
         now_ns += step_ns
         node.topics["/uav/odom"].waiting.append(message)
         before = len(told_ns)
         poses.tick(now_ns)
-        heard = heard or len(told_ns) > before
+        received = received or len(told_ns) > before
         gone = track.gone(now_ns)
-        assert gone == (heard and now_ns - told_ns[-1] > 2 * NS_PER_S)
-        heard = heard and not gone
-        assert (track.place is None) == (not heard)
+        assert gone == (received and now_ns - told_ns[-1] > 2 * NS_PER_S)
+        received = received and not gone
+        assert (track.place is None) == (not received)
     assert all(later - sooner >= int(NS_PER_S / hz) for sooner, later in pairwise(told_ns))
     assert len(told_ns) + poses.refused <= len(words)
 
@@ -340,8 +340,8 @@ def test_a_place_is_followed_until_the_robot_is_there_and_then_its_target_again(
     for cells, status in (((end - 1, end), "ok"), ((end - 1,), "unreachable")):
         robot._followed.put(Route(frame, "", status, cells, 1.0, 1.0, 0.0))  # type: ignore[union-attr]
         world.run("one", 1)
-    assert [each.message for each in world.node.heard["/one/plan_certificate"]] == ["ok", "unreachable"]
-    assert not world.node.heard["/one/goal_pose"], "the gateway repeats no goal of another"
+    assert [each.message for each in world.node.received["/one/plan_certificate"]] == ["ok", "unreachable"]
+    assert not world.node.received["/one/goal_pose"], "the gateway repeats no goal of another"
     world.say("one", "odom", 5, 5)
     assert world.follows("one") == "fox"
 
@@ -350,7 +350,7 @@ def test_no_plan_to_another_goal_stays() -> None:
     world = World()
     for col, plans in ((5, 1), (5, 1), (6, 2)):
         world.say("one", "goal_pose", 5, col)
-        assert [len(each) for each in world.node.heard["/one/plan"]] == [len(world.messages.path(0, ()))] * plans
+        assert [len(each) for each in world.node.received["/one/plan"]] == [len(world.messages.path(0, ()))] * plans
 
 
 @pytest.mark.parametrize("frame", ["odom", "targets/a b", "targets/"])
@@ -359,7 +359,7 @@ def test_a_goal_that_is_refused_ends_the_one_before_and_the_plan_says_so(frame: 
     world.say("one", "goal_pose", 5, 5)
     world.say("one", "goal_pose", 6, 6, frame)
     assert world.follows("one") == "fox"
-    assert [each.level for each in world.node.heard["/one/plan_certificate"]] == [Level.ERROR]
+    assert [each.level for each in world.node.received["/one/plan_certificate"]] == [Level.ERROR]
 
 
 def test_what_is_called_as_a_vehicle_of_ours_is_no_robot_and_said_once(
@@ -443,9 +443,9 @@ def test_topics_of_another_gateway_are_no_robots() -> None:
         seen = Endpoint(
             NodeName(0, "ab", name), number, Kind.PUBLISHER, f"/r{number}/odom", kind, TYPES.hash_of(kind), ""
         )
-        node.tell(seen, True)
+        node.report(seen, True)
     incoming.tick(NS_PER_S)
     assert set(incoming.robots) == {"r1"}
-    node.tell(seen, False)
+    node.report(seen, False)
     incoming.tick(2 * NS_PER_S)
     assert not incoming.robots

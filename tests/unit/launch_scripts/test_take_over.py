@@ -231,10 +231,10 @@ def test_the_port_of_figures_is_opened_once_the_launcher_before_has_left_it(tmp_
     with pytest.raises(BusError, match="Address already in use"):
         LauncherHealth(options, "run-1", list)
     after = LauncherHealth(dataclasses.replace(options, takes_over=True), "run-1", list)
-    after.turned(observed, 0, [])
+    after.on_turn(observed, 0, [])
     assert after.url == ""
     before.close()
-    after.turned(observed, 0, [])
+    after.on_turn(observed, 0, [])
     assert after.url == before.url
     after.close()
 

@@ -465,7 +465,7 @@ def test_ways_are_computed_one_a_tick() -> None:
     budget = Budget()
     walkers = [walker(where, 100 * n, "waypoints", budget=budget) for n in range(4)]
     for ticked in range(1, 5):
-        budget.ways = 1
+        budget.paths = 1
         for one in walkers:
             one.advance(0.1, lambda: NOBODY)
         assert sum(1 for one in walkers if one.towards is not None) == ticked

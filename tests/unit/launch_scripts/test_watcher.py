@@ -40,8 +40,8 @@ def begun() -> tuple[SwarmModel, Watcher, list[object]]:
     swarm = SwarmModel()
     recorder = Recorder(swarm.scenario, swarm.terrain.grid)
     heard: list[object] = []
-    record = recorder.heard
-    recorder.heard = lambda message, *rest: (heard.append(message), record(message, *rest))[1]  # type: ignore[method-assign]
+    record = recorder.on_message
+    recorder.on_message = lambda message, *rest: (heard.append(message), record(message, *rest))[1]  # type: ignore[method-assign]
     watcher = Watcher(swarm.bus("launcher"), recorder, swarm.scheduler.clock)
     return swarm, watcher, heard
 
@@ -134,7 +134,7 @@ class Part:
         grid = self.swarm.terrain.grid
         self.known: Any = Recorder(SCENARIO, grid, 0) if records else OwnPart(grid, 0)
         self.watcher = Watcher(self.swarm.bus("launcher"), self.known, self.swarm.scheduler.clock)
-        self.watcher.look_after(own)
+        self.watcher.set_own(own)
         self.buses = {spec: self.swarm.bus(spec.name) for spec in PROCESSES}
         self.said = 0
 
@@ -169,7 +169,7 @@ def test_whatever_processes_it_has_it_hears_those_and_no_others_also_after_they_
     part.speak()
     part.watcher.take_notes()
     for own in (first, then):
-        part.watcher.look_after(own)
+        part.watcher.set_own(own)
         part.swarm.run(0.1)
         part.speak()
         notes = part.watcher.take_notes()
@@ -212,14 +212,14 @@ def test_what_operators_order_is_heard_so_that_planners_of_added_targets_start_a
 def test_a_process_of_its_own_that_is_gone_is_an_alarm_and_one_of_another_machine_is_not() -> None:
     mine, other = ProcessSpec("planner", "t0", added=True), ProcessSpec("planner", "t1", added=True)
     known = OwnPart(SwarmModel().terrain.grid, 0)
-    known.look_after(frozenset({mine, *processes_of(SCENARIO, ("router", "monitor"))}))
+    known.set_own(frozenset({mine, *processes_of(SCENARIO, ("router", "monitor"))}))
     now_ns = 100 * NS_PER_S
     known.started(Peer(mine.role, mine.id, 7))
     known.alive(Peer(mine.role, mine.id, 6), True, now_ns)  # another run's
     assert known.own_up() == []
     for spec in (mine, other):
         known.alive(Peer(spec.role, spec.id, 7), True, now_ns)
-        known.heard(figures(spec, now_ns), now_ns)
+        known.on_message(figures(spec, now_ns), now_ns)
     assert known.own_alarms(now_ns) == []
     for spec in (mine, other):
         known.alive(Peer(spec.role, spec.id, 7), False, now_ns)
@@ -325,11 +325,11 @@ def test_only_what_is_due_is_taken_and_at_the_end_all_of_it() -> None:
         agent.publish(STATS, COUNTED, role="agent", id="a0")
         swarm.run(0.1)
         observer._bus.gather()
-        due = [heard.topic.name for heard in observer.due(tick * NS_PER_S // 4)]
+        due = [each.topic.name for each in observer.due(tick * NS_PER_S // 4)]
         assert (FLEET.name in due) == (tick == 0)
         assert STATS.name in due
     observer._bus.gather()
-    assert FLEET.name in [heard.topic.name for heard in observer.due(NS_PER_S // 2, all=True)]
+    assert FLEET.name in [each.topic.name for each in observer.due(NS_PER_S // 2, all=True)]
 
 
 # --- `swarm status` during an upgrade -----------------------------------------------------------------------------
@@ -351,10 +351,10 @@ def printed(status: Status) -> str:
 
 def test_every_view_says_who_stands_by_order_and_what_ends_that() -> None:
     status = told_by(a0=9)
-    status.latest.heard(fleet(100.0, ("a0-00", 1), ("a0-01", 2)), 0)
+    status.latest.on_message(fleet(100.0, ("a0-00", 1), ("a0-01", 2)), 0)
 
     def told(*orders: Order) -> str:
-        status.latest.heard(Orders(role="keeper", id="0", orders=orders), 0)
+        status.latest.on_message(Orders(role="keeper", id="0", orders=orders), 0)
         return printed(status)
 
     freed = Order(subject="vehicle", name="a0-01", stamp_ns=1, off=True)
@@ -367,12 +367,12 @@ def test_every_view_says_who_stands_by_order_and_what_ends_that() -> None:
 
 def test_each_vehicle_is_shown_with_where_it_is_and_where_it_drives_to_but_those_recalled() -> None:
     status = told_by(a0=9)
-    status.latest.heard(fleet(100.0, ("a0-00", 1), ("a0-01", 2)), 0)
+    status.latest.on_message(fleet(100.0, ("a0-00", 1), ("a0-01", 2)), 0)
     sent = GoalState(name="a0-01", stamp_ns=1, done=2, state="blocked", cell=7, reason="no way leads there")
     recalled = GoalState(name="a0-02", stamp_ns=1, done=0, state="canceled")
-    status.latest.heard(GoalStates(agent="a0", stamp_ns=1, states=[sent, recalled]), 0)
+    status.latest.on_message(GoalStates(agent="a0", stamp_ns=1, states=[sent, recalled]), 0)
     for id, x_m in (("away", -1e6), ("rover", 225.0)):
-        status.latest.heard(Obstacle(id=id, incarnation=1, seq=1, x_m=x_m, y_m=-135.0, radius_m=1.0), 0)
+        status.latest.on_message(Obstacle(id=id, incarnation=1, seq=1, x_m=x_m, y_m=-135.0, radius_m=1.0), 0)
     text = printed(status)
     assert "a0-01: blocked to cell:1,2 (xy:225,-135) (no way leads there), 2 reached" in text
     assert "sent to places 1 blocked" in text
@@ -401,7 +401,7 @@ def test_an_upgrade_under_way_is_shown_with_those_that_speak_the_older_version()
     status = told_by(a0=8, a1=9, a2=9)
     assert "an upgrade is under way: wire version 9, but 8 of agent-a0" in printed(status)
     assert "1 of 4 did not answer within 4 s: agent-gone" in printed(status)
-    status.latest.heard(stats(id="gone", stamp_ns=2, gauges={ENDED: 1.0}), 0)
+    status.latest.on_message(stats(id="gone", stamp_ns=2, gauges={ENDED: 1.0}), 0)
     assert "did not answer" not in printed(status)
     assert {each["id"]: each["wire_version"] for each in status_fields(status)["processes"]} == {
         "a0": 8, "a1": 9, "a2": 9,
