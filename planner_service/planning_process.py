@@ -163,7 +163,7 @@ class PlanningProcess(MemberService):
                 self._bus.serve(topic, self._post, **fields)
             else:
                 self._bus.unserve(topic, **fields)
-        self._candidacy.tell(self._member, now_ns)
+        self._candidacy.note_lead(self._member, now_ns)
 
     def _push(self, route: PushedRoute) -> None:
         self._bus.publish(PUSHED_ROUTE, route, agent=agent_of(route.vehicle), vehicle=route.vehicle)

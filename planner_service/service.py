@@ -227,7 +227,7 @@ class PlannerService(PlanningProcess):
             log.info("first tree: target %s, map version %d", self._target, self._planner.tree.map_version)
         self._warn_lethal(now_ns)
         self._warn_no_tracker(now_ns)
-        self._member.tell_faults(self._faults, now_ns)
+        self._member.note_faults(self._faults, now_ns)
         self._member.tick(now_ns)
 
     def _warn_lethal(self, now_ns: int) -> None:

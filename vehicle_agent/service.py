@@ -252,7 +252,7 @@ class AgentService(MemberService):
             else:
                 self._bus.publish(topics.CHASERS, chasers, target=chasers.target, author=self._author)
         self._right_of_way.tick(agent.cell_requests, now_ns)
-        self._member.tell_faults(parts.faults, now_ns)
+        self._member.note_faults(parts.faults, now_ns)
         states = bytes([vehicle.state for vehicle in agent.vehicles.values()])
         for state, name in _GAUGES:
             self.counters.gauge(name, float(states.count(state)))

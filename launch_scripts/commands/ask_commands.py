@@ -220,7 +220,7 @@ def metrics(
             while True:
                 observer.listen(clock, _TURN_S)
                 endpoint.answer(figures)
-                health.turned([] if observer.run is not None else ["a run"])
+                health.on_turn([] if observer.run is not None else ["a run"])
                 if observer.run is not None and observer.run.run_id != printed:
                     printed = observer.run.run_id
                     typer.echo(f"run {printed}, scenario {observer.run.scenario}")

@@ -22,7 +22,7 @@ from launch_scripts.report import AREAS
 from launch_scripts.report.gis_formats import TIFF, check_target, write_raster
 from launch_scripts.typer_commands import command, family_app
 from shared_map.terrain.pace_layers import TerrainClass
-from shared_map.terrain.slope_and_climb import said_of_cost
+from shared_map.terrain.slope_and_climb import cost_sentence
 from shared_map.terrain.terrain import Terrain, build_terrain
 from shared_map.terrain.terrain_report import facts_of, lines_of, notes_and_doubts
 from swarm.config.ground import CostConfig, TerrainConfig
@@ -144,7 +144,7 @@ def cost(
         if out is not None:
             pace = np.where(np.isfinite(terrain.pace_s_per_m), terrain.pace_s_per_m, np.float32(-1))
             bands = ["pace, seconds per metre; -1 lethal"]
-            about = {"TIFFTAG_IMAGEDESCRIPTION": said_of_cost(of_class(loaded, vehicle_class).cost)}
+            about = {"TIFFTAG_IMAGEDESCRIPTION": cost_sentence(of_class(loaded, vehicle_class).cost)}
             write_raster(out, [pace], terrain.grid, descriptions=bands, unit="s/m", tags=about, nodata=-1.0)
             show("writing", 1.0)
     name = loaded.name if loaded.name != "unnamed" else Path(loaded.terrain.source).stem

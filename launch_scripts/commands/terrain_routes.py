@@ -20,7 +20,7 @@ from planner_service.route_finder import RouteFinder
 from shared_map.array_files import Floats
 from shared_map.terrain.map_frame import MapFrame, middles_of
 from shared_map.terrain.pace_layers import TerrainClass, nearest_open
-from shared_map.terrain.slope_and_climb import said_of_cost
+from shared_map.terrain.slope_and_climb import cost_sentence
 from shared_map.terrain.terrain import Terrain, build_terrain
 from shared_map.terrain.zones import closing_zones
 from swarm.config.scenario import PlannerConfig, Scenario
@@ -194,7 +194,7 @@ def find_route(scenario: Scenario, start: str, end: str) -> DescribedRoute:
         at_s=np.concatenate(([0.0], np.cumsum(steps_s))),
         height_m=terrain.elevation_m.reshape(-1)[cells].astype(np.float64),
         terrain=terrain,
-        rule=said_of_cost(scenario.cost),
+        rule=cost_sentence(scenario.cost),
     )
 
 
@@ -300,7 +300,7 @@ def reach(scenario: Scenario, place: str) -> Reach:
     goal = read_place(place, "--to")
     terrain = build_terrain(scenario)
     seconds = _to(scenario, terrain, cell_of(goal, MapFrame(terrain.grid), "--to"), "--to")
-    return Reach(terrain.grid, seconds, said_of_cost(scenario.cost))
+    return Reach(terrain.grid, seconds, cost_sentence(scenario.cost))
 
 
 def corridor(scenario: Scenario, start: str, end: str, slack: float) -> Reach:
@@ -329,7 +329,7 @@ def corridor(scenario: Scenario, start: str, end: str, slack: float) -> Reach:
     )
     through[best.cells[:, 0], best.cells[:, 1]] = best.cost_s
     through[through > best.cost_s * (1 + slack)] = np.inf
-    return Reach(terrain.grid, through.astype(np.float32), said_of_cost(scenario.cost), best.cost_s)
+    return Reach(terrain.grid, through.astype(np.float32), cost_sentence(scenario.cost), best.cost_s)
 
 
 def there_s(back_s: Floats, pace: Floats, resolution_m: float, rules: PlannerConfig) -> NDArray[np.float64]:

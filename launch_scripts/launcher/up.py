@@ -37,7 +37,7 @@ from launch_scripts.web.live_page import LivePage, when_free
 from shared_map.array_files import Floats
 from shared_map.terrain.store import load_beside, load_terrain, load_truth, prepare, scenario_key
 from shared_map.terrain.terrain import Terrain
-from shared_map.terrain.terrain_report import said_of
+from shared_map.terrain.terrain_report import terrain_lines
 from shared_map.vehicle_class_grounds import prepare_classes
 from swarm.bus.bus import Bus
 from swarm.bus.zenoh_bus import open_bus
@@ -325,7 +325,9 @@ class _Run:
                 so_far += f", {self._startup_s:.1f} s after launch{self._limit('; the run lasts')}"
                 self._terminal.say(f"all processes are alive and {so_far}")
                 self._register()  # `up -d` shows what was said before
-                for line in said_of(self._terrain):  # now: its corners in degrees take a library that is large
+                for line in terrain_lines(
+                    self._terrain
+                ):  # now: its corners in degrees take a library that is large
                     self._terminal.say(line)
             # Time counts from when the swarm is up; one that never comes up must end too.
             limit_s = self._scenario.seconds + (_UP_WITHIN_S if self._startup_s is None else 0.0)

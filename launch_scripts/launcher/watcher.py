@@ -233,7 +233,7 @@ class LauncherHealth:
         up       (role, id) of the living processes, if these are a part of the run; None: the whole run is
                  observed, so the metrics name it
         """
-        self._health.turned([f"word of {name}" for name in missing])
+        self._health.on_turn([f"word of {name}" for name in missing])
         with suppress(BusError):  # the launcher before still has the port
             self._open()
         if self._metrics is not None:

@@ -86,7 +86,7 @@ def directional_factor(rise: Floats, cost: CostConfig) -> Floats:
     return _without_steeper(_without_steeper(factor, sine, climb_deg), -sine, descent_deg)
 
 
-def said_of_cost(cost: CostConfig) -> str:
+def cost_sentence(cost: CostConfig) -> str:
     """A sentence for people who look at a terrain: by which rule its slopes cost."""
     row = SLOPE_RULES[cost.slope_rule]
     way = "the mean of up and down" if row.is_directed else "the same up and down"

@@ -23,7 +23,7 @@ from shared_map.terrain import pace_layers
 from shared_map.terrain.cost_layers import apply_cost_layers, cost_world
 from shared_map.terrain.pace_layers import TerrainClass
 from shared_map.terrain.row_bands import Progress, in_bands, no_progress, padded_rows
-from shared_map.terrain.slope_and_climb import Climb, climb_of, said_of_cost
+from shared_map.terrain.slope_and_climb import Climb, climb_of, cost_sentence
 from shared_map.terrain.zones import ZoneFacts, paint_zones
 from swarm.config.explain import converted
 from swarm.config.ground import CostConfig
@@ -121,7 +121,7 @@ def _built(scenario: Scenario, source: Source, progress: Progress, common: CostC
             classes = classes.copy()
         zones = paint_zones(ground, cost.zones, grid, cost, np.isnan(source.elevation_m), classes)
         notes.extend(each.sentence(grid.cells) for each in zones if each.file is not None)
-    notes.append(said_of_cost(cost))
+    notes.append(cost_sentence(cost))
     photo = source.photo
     if photo is None:
         from shared_map.terrain.synthetic import paint_photo

@@ -112,7 +112,7 @@ def doubts_about(facts: dict[str, Any]) -> list[str]:
     return doubts
 
 
-def said_of(terrain: Terrain) -> list[str]:
+def terrain_lines(terrain: Terrain) -> list[str]:
     """Returns a run's sentences about its terrain before any vehicle drives: numbers, processing, doubts."""
     grid, lethal = terrain.grid, float(np.isinf(terrain.pace_s_per_m).mean())
     water = float((terrain.classes == TerrainClass.WATER).mean())

@@ -203,7 +203,7 @@ class Candidacy:
             self._heartbeat(ready, leads)
         return leads
 
-    def tell(self, member: Member, now_ns: int) -> None:
+    def note_lead(self, member: Member, now_ns: int) -> None:
         """Notes for people whether this process leads from now on. Without standbys there is nothing to note."""
         if not self._standbys:
             return

@@ -132,7 +132,7 @@ class Supervisor:
         self._status = "".join(each if each.isprintable() else " " for each in what)[:_LONGEST_STATUS]
         self._send([])
 
-    def turned(self, now_ns: int) -> None:
+    def on_turn(self, now_ns: int) -> None:
         """The loop has turned: at the first time the process is up, at later ones it is still alive."""
         words = [] if self._sent_ready else ["READY=1"]
         if self._every_ns is not None and now_ns >= self._due_ns:
@@ -275,7 +275,7 @@ class Health:
         """The loop ticks from now on, at this rate."""
         self._limit_ns = int(max(HUNG_S, HUNG_PERIODS / tick_hz) * NS_PER_S)
 
-    def turned(self, lacks: Sequence[str]) -> None:
+    def on_turn(self, lacks: Sequence[str]) -> None:
         """The loop has ticked. `lacks`: as in `Vitals`."""
         now_ns = time.monotonic_ns()
         vitals = Vitals(now_ns, self._limit_ns, Phase.RUNS, tuple(lacks))
@@ -284,7 +284,7 @@ class Health:
             self._write(vitals)
         if news:
             self._supervisor.says(f"waits for {', '.join(lacks)}" if lacks else "ready")
-        self._supervisor.turned(now_ns)
+        self._supervisor.on_turn(now_ns)
 
     def ends(self) -> None:
         """Reports that the loop has ended, and that the process ends next."""

@@ -286,7 +286,7 @@ class Member:
         self.counters.count(kind)
         self.note(now_ns, kind, text)
 
-    def tell_faults(self, faults: list[str], now_ns: int) -> None:
+    def note_faults(self, faults: list[str], now_ns: int) -> None:
         """States what plug-ins did wrong, and clears the list."""
         for fault in faults:
             self.warn(now_ns, "plugin_failed", fault)

@@ -318,7 +318,7 @@ class Process:
                 now_ns = self._after_inbox_ns()
                 self._service.tick(now_ns)
                 if self._health is not None:
-                    self._health.turned(self._service.lacks())
+                    self._health.on_turn(self._service.lacks())
                 took_ns = self._clock.now_ns() - now_ns
                 events_until_ns = now_ns + 2 * took_ns
                 counters.observe("tick_ms", took_ns / 1e6)

@@ -137,14 +137,14 @@ class TargetsService(MemberService):
         leads = self._candidacy.tick(self._world.ready, now_ns)
         if leads != self._world.leads:
             self._world.lead(leads)
-            self._candidacy.tell(self._member, now_ns)
+            self._candidacy.note_lead(self._member, now_ns)
         if leads and self._world.listening and now_ns >= self._ask_due_ns:
             self._ask_due_ns = now_ns + _ASK_NS
             self._member.ask_by_name(COST, CostRequest(), tag=_ASK)
         self._obey(now_ns)
         planned = {job_of(id) for _, id in self._planners.up()}
         self._perform(self._world.tick(now_ns, planned), now_ns)
-        self._member.tell_faults(self._world.faults, now_ns)
+        self._member.note_faults(self._world.faults, now_ns)
         self._member.tick(now_ns)
 
     def stop(self, now_ns: int) -> None:

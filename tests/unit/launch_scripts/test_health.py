@@ -108,9 +108,9 @@ def test_a_probe_is_told_what_is_missing_and_exits_by_it(
     assert fast(words) == 1
     assert capsys.readouterr().out == "not ready\nagent-a0: its start\n"
     assert fast([*words, "--live"]) == 0
-    health.turned(["places for its vehicles"])
+    health.on_turn(["places for its vehicles"])
     assert fast(words) == 1
-    health.turned([])
+    health.on_turn([])
     assert fast([*words, "--json"]) == 0
     assert json.loads(capsys.readouterr().out.partition("vehicles\n")[2])["status"] == "ready"
     assert ask(f"{server.url}/healthz", live=False).page["status"] == "healthy", "a path is asked as it is"

@@ -98,12 +98,12 @@ def says(name: str, what: Callable[[Health], None]) -> Callable[[Machine], None]
 
 
 EVENTS: dict[str, Callable[[Machine], object]] = {
-    "t0 answers": says("planner-t0", lambda health: health.turned([])),
-    "t1 answers": says("planner-t1.r1", lambda health: health.turned([])),
-    "t1 has no map": says("planner-t1.r1", lambda health: health.turned(["the shared map"])),
+    "t0 answers": says("planner-t0", lambda health: health.on_turn([])),
+    "t1 answers": says("planner-t1.r1", lambda health: health.on_turn([])),
+    "t1 has no map": says("planner-t1.r1", lambda health: health.on_turn(["the shared map"])),
     "agent starts": says("agent-a0", lambda health: health.starts("its start")),
     "agent waits": says("agent-a0", lambda health: health.starts(GENERATION_BEFORE)),
-    "agent answers": says("agent-a0", lambda health: health.turned([])),
+    "agent answers": says("agent-a0", lambda health: health.on_turn([])),
     "ten seconds pass": lambda machine: setattr(machine, "now_s", machine.now_s + 10.0),
     "one ends": Machine.one_ends,
     "keeper crashes": lambda machine: machine.alive.discard(machine.predecessors["keeper-0"]),

@@ -178,11 +178,11 @@ def test_a_manager_that_reads_nothing_holds_no_one_up_and_hears_of_the_start_lat
     fill(manager)
     began_s = time.monotonic()
     for now_ns in range(1, 1000):
-        supervisor.turned(now_ns)
+        supervisor.on_turn(now_ns)
     assert time.monotonic() - began_s < 5
     while manager.recv(100) == b"x" and select.select([manager], [], [], 0)[0]:
         pass
-    supervisor.turned(2000)
+    supervisor.on_turn(2000)
     assert told(manager)[0] == "READY=1"
 
 
@@ -210,7 +210,7 @@ def test_a_name_in_the_abstract_namespace_is_a_manager_too() -> None:
         name = f"terrain-swarm-test-{os.getpid()}"
         listening.bind(f"\0{name}")
         listening.settimeout(10)
-        supervisor_of({"NOTIFY_SOCKET": f"@{name}"}).turned(1)
+        supervisor_of({"NOTIFY_SOCKET": f"@{name}"}).on_turn(1)
         assert listening.recv(100) == b"READY=1"
 
 
@@ -236,7 +236,7 @@ def test_no_text_makes_a_word_of_its_own(text: str) -> None:
 def test_a_process_without_a_manager_goes_on(environment: dict[str, str]) -> None:
     supervisor = supervisor_of(environment)
     supervisor.says("x")
-    supervisor.turned(1)
+    supervisor.on_turn(1)
     supervisor.ends()
 
 

@@ -85,6 +85,6 @@ def test_a_planner_remembers_no_more_authors_than_followers() -> None:
     followers = Followers(GRID, 5 * NS_PER_S, 0)
     for n in range(5000):
         followers.on_chasers(Chasers(target="t0", author=f"x{n}", stamp_ns=0, ids=[], cells=b""), 0)
-    assert len(followers._told) == 4096
+    assert len(followers._reports) == 4096
     followers.drop_silent(6 * NS_PER_S)
-    assert len(followers._told) == 0
+    assert len(followers._reports) == 0
