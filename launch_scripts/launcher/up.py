@@ -325,9 +325,8 @@ class _Run:
                 so_far += f", {self._startup_s:.1f} s after launch{self._limit('; the run lasts')}"
                 self._terminal.say(f"all processes are alive and {so_far}")
                 self._register()  # `up -d` shows what was said before
-                for line in terrain_lines(
-                    self._terrain
-                ):  # now: its corners in degrees take a library that is large
+                # Only now: its corners in degrees take a library that is large.
+                for line in terrain_lines(self._terrain):
                     self._terminal.say(line)
             # Time counts from when the swarm is up; one that never comes up must end too.
             limit_s = self._scenario.seconds + (_UP_WITHIN_S if self._startup_s is None else 0.0)
