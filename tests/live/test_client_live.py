@@ -87,19 +87,17 @@ def test_the_rover_of_the_page_joins_drives_to_its_target_marks_and_leaves(live:
         assert (first.state, first.group) == ("outside", "all")
 
 
-def test_the_rover_of_the_page_drives_with_right_of_way(live: LiveSwarm) -> None:
-    places: set[tuple[float, float]] = set()
-
-    def has_driven() -> bool:
-        if (rover := watching.vehicles.get("rover")) is not None:
-            places.add((rover.x_m, rover.y_m))
-        return len(places) > 20
-
+def test_the_rover_of_the_page_enters_only_what_it_reserves(live: LiveSwarm) -> None:
     with connect(live.endpoint) as swarm, swarm.observer() as watching:
+        swarm.orders().chase("all", ["t1"])  # a target that others catch would jump away from the rover
         run = Run((EXAMPLES / "reserving_vehicle.py").read_text(), live.endpoint)
-        eventually(has_driven, 60, "its driving")  # not its arrival: others catch the target, which jumps
-        run.process.kill()
-        assert run.process.communicate(timeout=10)[0] == ""
+        eventually(lambda: "rover" in watching.vehicles, 20, "the rover's first word")
+        start = watching.vehicles["rover"].x_m, watching.vehicles["rover"].y_m
+        eventually(
+            lambda: (watching.vehicles["rover"].x_m, watching.vehicles["rover"].y_m) != start, 20, "its driving"
+        )
+        assert (run.end(within_s=90), run.process.returncode) == ("", 0)
+        swarm.orders().chase("all", None)
 
 
 def test_the_tracker_of_the_page_moves_its_target_and_the_planner_follows(live: LiveSwarm, swarm: Swarm) -> None:
