@@ -19,7 +19,7 @@ from shared_map.terrain.slope_and_climb import Climb
 from swarm.config.explain import check_keywords, choice, converted
 from swarm.config.scenario import PlannerConfig
 from swarm.errors import ArgumentError
-from swarm.grid import GridSpec, Window, quoted, real, walk, whole
+from swarm.grid import GridSpec, Window, brief, real, walk, whole
 from swarm.wire.route_columns import Route, RouteStatus, TargetStatus, directions_of
 
 _KEPT_BYTES = 1 << 28
@@ -230,7 +230,7 @@ class RouteFinder:
 def _check_type(name: str, value: object, kind: Any) -> None:
     """Raises ArgumentError unless a value is of this type."""
     if not isinstance(value, kind):
-        raise ArgumentError(f"{name} is {quoted(value)}, expected {getattr(kind, '__name__', kind)}")
+        raise ArgumentError(f"{name} is {brief(value)}, expected {getattr(kind, '__name__', kind)}")
 
 
 def _whole(place: Any) -> tuple[int, int]:
@@ -239,7 +239,7 @@ def _whole(place: Any) -> tuple[int, int]:
     try:
         row, col = map(int, np.array([whole("row or column", each) for each in place], np.int64))
     except (TypeError, ValueError, OverflowError) as error:
-        raise ArgumentError(f"{quoted(place)} is no cell, which is two whole numbers, such as 1, 1") from error
+        raise ArgumentError(f"{brief(place)} is no cell, which is two whole numbers, such as 1, 1") from error
     return row, col
 
 

@@ -15,7 +15,7 @@ from typing import Literal, Protocol
 
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec
-from swarm.plugins import Guard, Nonsense, Plugin, Tell
+from swarm.plugins import Guard, Nonsense, OnFault, Plugin
 
 AHEAD = 16
 """A window reaches this multiple of the target's distance since the last one as wide."""
@@ -155,7 +155,7 @@ STRATEGIES: Mapping[str, Callable[[], Strategy]] = {
 """Every built-in strategy."""
 
 
-def strategy_of(plugin: Plugin, world: StrategyWorld, report: Tell) -> Strategy:
+def strategy_of(plugin: Plugin, world: StrategyWorld, report: OnFault) -> Strategy:
     """The strategy that a scenario names. Raises ConfigError if it cannot be made; `report` is called with a later
     fault."""
     if plugin.factory is None:

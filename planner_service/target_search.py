@@ -416,7 +416,7 @@ LOST_NS = 30 * NS_PER_S
 LISTEN_NS = 5 * NS_PER_S
 """A planner that has just begun listens for this time before it takes its target for never seen
 (docs/design/search.md)."""
-_TELL_NS = NS_PER_S
+_PUBLISH_EVERY_NS = NS_PER_S
 _LONGEST_S = 1e7
 """Some four months, so that the age of a target that was never seen is a number."""
 
@@ -465,7 +465,7 @@ class TargetSearch:
         """The newest sighting that had expired when it was heard."""
         self._begun_from: Sighted | None = None
         """By which of these the search began."""
-        self._publish_ns = 0
+        self._publish_due_ns = 0
         self._has_published = False
         """True if the last message was about a search under way."""
         self._searched: TargetPose | None = None
@@ -527,9 +527,9 @@ class TargetSearch:
 
     def belief_message(self, target: str, incarnation: int, now_ns: int) -> Believed | None:
         """Returns the belief, for people; None if it is not due."""
-        if now_ns < self._publish_ns or not (self.active or self._has_published):
+        if now_ns < self._publish_due_ns or not (self.active or self._has_published):
             return None
-        self._publish_ns = now_ns + _TELL_NS
+        self._publish_due_ns = now_ns + _PUBLISH_EVERY_NS
         self._has_published = self.active
         cells, shares, side_m = self.searcher.likeliest(MOST_BELIEVED)
         return Believed(

@@ -18,7 +18,7 @@ _MOST_NAMED = 256
 
 
 @dataclass(frozen=True, slots=True)
-class Tell:
+class Notice:
     """A sentence for people who watch the run; `cell` is where, if anywhere."""
 
     kind: str
@@ -49,7 +49,7 @@ class TargetWatch:
         """Tracker, or incarnation of one without a name -> its poses that were refused."""
         self._named: set[tuple[str, str | int]] = set()
         """(kind of oddity, tracker), reported before."""
-        self._pending: list[Tell] = []
+        self._pending: list[Notice] = []
         for name in COUNTS:
             counters.count(name, 0)
 
@@ -90,7 +90,7 @@ class TargetWatch:
         if self._tracking.pose is not before:
             self._found("a vehicle sees it", now_ns)
 
-    def drain(self, now_ns: int) -> list[Tell]:
+    def drain(self, now_ns: int) -> list[Notice]:
         """Returns the sentences for operators that are new, none on a standby."""
         if not self._lost and self._tracking.lost(now_ns):
             self._lose(now_ns)
@@ -151,7 +151,7 @@ class TargetWatch:
             self._note(kind, text)
 
     def _note(self, kind: str, text: str, cell: int | None = None) -> None:
-        self._pending.append(Tell(kind, f"target {self.target}: {text}", cell))
+        self._pending.append(Notice(kind, f"target {self.target}: {text}", cell))
 
 
 def _key(pose: TargetPose) -> str | int:

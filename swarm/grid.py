@@ -33,7 +33,7 @@ MAX_CELLS = 16384 * 16384
 """A larger grid is refused wherever one comes from outside."""
 
 
-def quoted(value: Any) -> str:
+def brief(value: Any) -> str:
     """A value for a sentence: short, and in one line."""
     return " ".join(reprlib.repr(value).split())
 
@@ -48,7 +48,7 @@ def whole(name: str, value: Any) -> int:
             return operator.index(value)
     except TypeError:
         pass
-    raise ArgumentError(f"{name} is {quoted(value)}, expected a whole number")
+    raise ArgumentError(f"{name} is {brief(value)}, expected a whole number")
 
 
 def real(name: str, value: Any, least: float = -math.inf, most: float = math.inf, *, more: bool = False) -> float:
@@ -66,7 +66,7 @@ def real(name: str, value: Any, least: float = -math.inf, most: float = math.inf
                 return found
             bounds = f"more than {least:g} and at most {most:g}" if more else f"{least:.4g} ... {most:g}"
             raise ArgumentError(f"{name} is {found!r}, expected {bounds}")
-    raise ArgumentError(f"{name} is {quoted(value)}, expected a number")
+    raise ArgumentError(f"{name} is {brief(value)}, expected a number")
 
 
 STEP_ROW = (-1, -1, 0, 1, 1, 1, 0, -1)
@@ -268,7 +268,7 @@ class GridSpec:
             row = math.floor((self.north_m - y_m) / self.resolution_m)
             col = math.floor((x_m - self.west_m) / self.resolution_m)
         except (ValueError, OverflowError) as error:
-            raise ArgumentError(f"x_m {quoted(x_m)}, y_m {quoted(y_m)} is no place") from error
+            raise ArgumentError(f"x_m {brief(x_m)}, y_m {brief(y_m)} is no place") from error
         return row * self.cols + col if self.inside(row, col) else -1
 
     def tile_of(self, cell: int) -> int:

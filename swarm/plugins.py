@@ -34,7 +34,7 @@ from swarm.config.scenario import Scenario
 from swarm.errors import ConfigError, SwarmError
 
 T = TypeVar("T")
-Tell = Callable[[str], None]
+OnFault = Callable[[str], None]
 """Takes a fault in one sentence."""
 
 
@@ -119,7 +119,7 @@ class Guard:
     works   false once it has failed: then it is not called any more
     """
 
-    def __init__(self, plugin: Plugin, report: Tell) -> None:
+    def __init__(self, plugin: Plugin, report: OnFault) -> None:
         self.works = True
         self._plugin = plugin
         self._report = report

@@ -14,7 +14,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from swarm.plugins import Guard, Nonsense, Plugin, Tell
+from swarm.plugins import Guard, Nonsense, OnFault, Plugin
 
 Costs = NDArray[np.float64]
 
@@ -131,7 +131,7 @@ def shares_costs(assigner: Assigner) -> bool:
     return getattr(assigner, "shares_costs", False) is True
 
 
-def assigner_of(plugin: Plugin, world: AssignmentWorld, report: Tell) -> Assigner:
+def assigner_of(plugin: Plugin, world: AssignmentWorld, report: OnFault) -> Assigner:
     """Returns the assigner that a scenario names, built-in or a plug-in. Raises ConfigError if it cannot be made.
 
     report  called with the fault if the plug-in fails later

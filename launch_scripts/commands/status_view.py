@@ -16,7 +16,7 @@ from rich.text import Text
 
 from launch_scripts.commands.shared_options import Where
 from launch_scripts.launcher import console as terminal
-from launch_scripts.launcher.console import Progress, progress
+from launch_scripts.launcher.console import progress
 from launch_scripts.observe import run_state as facts
 from launch_scripts.observe.latest_messages import LatestState
 from launch_scripts.observe.run_folders import pids_of
@@ -27,6 +27,7 @@ from launch_scripts.plain_text import plain, unanswered
 from launch_scripts.process_table import ROLES
 from launch_scripts.stop_requests import stop_requests
 from shared_map.terrain.map_frame import MapFrame
+from shared_map.terrain.row_bands import Progress, no_progress
 from swarm.bus.bus import Bus
 from swarm.clock import NS_PER_S, MonotonicClock
 from swarm.errors import BusError
@@ -113,9 +114,7 @@ class Status:
         return own + [row(id, each.x_m, each.y_m, **external) for id, each in outside]
 
 
-def observed(
-    bus: Bus, where: Where, least_s: float = _LISTEN_S, show: Progress = lambda what, share: None
-) -> OutsideObserver:
+def observed(bus: Bus, where: Where, least_s: float = _LISTEN_S, show: Progress = no_progress) -> OutsideObserver:
     """Context of an observer that has received the state of all processes which reply in time. Raises BusError if
     no process replies."""
     clock, observer = MonotonicClock(), OutsideObserver(bus)

@@ -29,12 +29,11 @@ from launch_scripts.observe.run_state import RunState, TargetLine
 from launch_scripts.observe.summed_counts import ProcessLoad, sum_of
 from launch_scripts.plain_text import plain
 from launch_scripts.process_table import ROLES
+from shared_map.terrain.row_bands import Progress
 from swarm.files import discard_output
 
 log = logging.getLogger(__name__)
 
-Progress = Callable[[str, float], None]
-"""Called with the current step and the share of it that is done."""
 _PATIENCE_S = 1.0
 """Shorter work has no progress line."""
 _PLAIN_EVERY_S = 5.0

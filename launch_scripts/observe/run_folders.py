@@ -350,7 +350,7 @@ def processor() -> str:
     return platform.processor() or platform.machine()
 
 
-LOOK_EVERY_S = 5.0
+CHECK_EVERY_S = 5.0
 """A full disk is reported within seconds, and a try is 64 kB, which no disk feels at this rate."""
 SAY_EVERY_S = 60.0
 """A full disk is named once a minute (docs/operate/failures.md): often enough to be seen, and the log stays
@@ -370,7 +370,7 @@ class DiskWatch:
         """A sentence for the user; None if there is nothing new to say. Call it often."""
         if now_s < self._due_s:
             return None
-        self._due_s = now_s + LOOK_EVERY_S
+        self._due_s = now_s + CHECK_EVERY_S
         try:
             check_writable(self._folder)
         except StoreError as error:

@@ -362,7 +362,7 @@ def lines(state: RunState) -> list[str]:
     return found
 
 
-_SAID_SINGLY = 2
+_LISTED_SINGLY = 2
 """Beyond this number alarms of one kind share one line: on a slow machine every process is behind."""
 
 
@@ -395,7 +395,7 @@ def _summed(alarms: Iterable[Alarm], key: Callable[[Alarm], Hashable]) -> Iterat
     for alarm in alarms:
         keys.setdefault(key(alarm), []).append(alarm)
     for some in keys.values():
-        if len(some) > _SAID_SINGLY:
+        if len(some) > _LISTED_SINGLY:
             yield together(some), some
         else:
             yield from ((each.line, [each]) for each in some)
@@ -406,7 +406,7 @@ def together(alarms: Sequence[Alarm]) -> str:
     longest = max(alarms, key=lambda alarm: alarm.lasted_s or 0.0)
     names = list(dict.fromkeys(alarm.about for alarm in alarms))
     of_many = kind_of(longest.kind).of_many
-    cause = f" ({of_many})" if of_many and len(names) > _SAID_SINGLY else ""
+    cause = f" ({of_many})" if of_many and len(names) > _LISTED_SINGLY else ""
     when = f"the longest {longest.when or 'now'}{cause}"
     return f"{longest.label}: {len(alarms):,} times, {first_of(names)}, {when}"
 

@@ -35,6 +35,7 @@ from shared_map.array_files import Floats
 from shared_map.keeper.mark_store import KEEPER_STORE, KeeperStore
 from shared_map.keeper.service import KeeperService
 from shared_map.keeper.zone_orders import ZONE_MODULES
+from shared_map.terrain.row_bands import Progress, no_progress
 from shared_map.terrain.terrain import Terrain, build_terrain
 from shared_map.terrain.true_ground import build_truth
 from swarm.bus.bus import Bus, Event, Post, Worker
@@ -433,9 +434,7 @@ class Simulation:
         self.scheduler.at(EPOCH_NS + int(seconds * NS_PER_S), action)
 
 
-def run_to_end(
-    simulation: Simulation, progress: Callable[[str, float], None] = lambda what, share: None
-) -> dict[str, Any]:
+def run_to_end(simulation: Simulation, progress: Progress = no_progress) -> dict[str, Any]:
     """Runs a simulation for the seconds of its scenario. Returns the numbers of report.json; the same for the same
     seed.
 

@@ -34,7 +34,7 @@ UNITS_M = {unit.removesuffix("s"): metres for unit, metres in _UNITS.items()}
 _MOST_CODES, _LEAST_CODES = 256, 3
 """Different values of a map of codes: as many as a byte has; and with fewer than three a height model in whole
 metres holds codes of a table by chance (docs/design/terrain-import.md)."""
-_LOOK_CELLS = 128
+_SAMPLE_CELLS = 128
 """Side of the sample that is examined first: most height models are ruled out by 16,384 heights."""
 
 
@@ -77,7 +77,7 @@ def holds_cover(dataset: Any, what: str, config: TerrainConfig) -> bool:
         return True
     has_palette = dataset.colorinterp[0] == ColorInterp.palette
     # A first look at the middle of a file: most height models are ruled out by it.
-    window = middle_of(dataset, _LOOK_CELLS)
+    window = middle_of(dataset, _SAMPLE_CELLS)
     values = dataset.read(1, window=window)[dataset.read_masks(1, window=window) > 0]
     gappy = {key: [*table.grounds, *table.nothing] for key, table in TABLES.items() if table.gappy}
     if not has_palette and not any(np.isin(values, codes).all() for codes in gappy.values()):

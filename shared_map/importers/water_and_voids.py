@@ -158,7 +158,7 @@ _STILL_M = 0.02
 see, a gentle slope is no lake: its far end is at another height."""
 _COARSE_M = 0.25
 """In whole metres gentle ground is level, too."""
-_LEAST_CELLS_TOLD, _LEAST_CELLS_FINE, _LEAST_CELLS_COARSE = 5, 16, 40
+_LEAST_CELLS_REPORTED, _LEAST_CELLS_FINE, _LEAST_CELLS_COARSE = 5, 16, 40
 """Cells of the smallest level patch: of one that is told although it is no water, and of water where heights have
 fine steps and coarse ones. In coarse steps more ground is level by chance. With 9 instead of 16, 0.5 % of the dry
 ground beside a river in steps of 0.25 m is water. The others are chosen, not measured."""
@@ -182,7 +182,7 @@ _AROUND_BLOCKS = 5
 _NOISY = 0.28
 """Water that a laser measured is rough by a decimetre or two, and level in the mean of 4 x 4 cells. From cell to
 cell it differs by a third of its range there; on gentle ground by a sixth, or at most a fourth."""
-_TOLD_SHARE = 0.001
+_REPORTED_SHARE = 0.001
 """The note has one decimal of a percent: a smaller share would be shown as 0.0 or 0.1 %."""
 _MUCH_WATER = 0.05
 """Share of the terrain from which on many small lakes are doubted: filled sinks. Chosen, not measured."""
@@ -224,12 +224,12 @@ def level_ground(elevation_m: Floats) -> LevelGround:
     mask, patches, level = _at_one_scale(np.ascontiguousarray(heights_m))
     finer = elevation_m.size / heights_m.size
     mask, level = mask[np.ix_(row, col)], level[np.ix_(row, col)]
-    least = max(min(int(_TOLD_SHARE * elevation_m.size), _LEAST_CELLS_COARSE), _LEAST_CELLS_TOLD)
+    least = max(min(int(_REPORTED_SHARE * elevation_m.size), _LEAST_CELLS_COARSE), _LEAST_CELLS_REPORTED)
     if finer > 1 or least < _LEAST_CELLS_COARSE:
         # No level patch of the file itself becomes ground in silence, even if the survey is estimated wrongly.
         own = level_patches(elevation_m, _SAME_M, least)
         missed = own.cells - np.bincount(own.labels[mask], minlength=own.cells.size)
-        large = (own.cells > _TOLD_SHARE * elevation_m.size) & (2 * missed > own.cells)
+        large = (own.cells > _REPORTED_SHARE * elevation_m.size) & (2 * missed > own.cells)
         large[0] = False
         level |= large[own.labels]
     patches = sorted(((height_m, round(cells * finer)) for height_m, cells in patches), key=lambda patch: -patch[1])
@@ -243,7 +243,7 @@ def _at_one_scale(elevation_m: Floats) -> tuple[Bools, list[tuple[float, int]], 
     found = level_patches(elevation_m, _SAME_M, least_cells)
     water, unsure = _judged(found, elevation_m, _SAME_M, _STILL_M, step_m)
     mask: Bools = water[found.labels]
-    large = unsure | (found.cells > _TOLD_SHARE * elevation_m.size)
+    large = unsure | (found.cells > _REPORTED_SHARE * elevation_m.size)
     large[0] = False
     patches = [(float(found.height_m[n]), int(found.cells[n])) for n in np.flatnonzero(water).tolist()]
     if step_m < _ROUGH_M / _BLOCK_CELLS:
@@ -369,7 +369,7 @@ def examined(
             f"{'! ' * filled}level ground: {share:.1%} of the file in {many} patch{'es' * (many > 1)},"
             f" the largest {cells} cells at {height_m:g} m, {taken}"
         )
-    if found.uncertain > _TOLD_SHARE and config.level_is == "water":
+    if found.uncertain > _REPORTED_SHARE and config.level_is == "water":
         notes.append(
             f"! level ground: {found.uncertain:.1%} of the file is level, but counts as ground, because its shore"
             " is not like that of water or its heights are rounded; if it is water, set terrain.water_below_m"

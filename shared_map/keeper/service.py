@@ -51,7 +51,7 @@ _COMPACT_TILES = 16
 _MOST_FIGURES = 1 << 20
 """Figures in all `Stats` together, some 100 MB: those of 1,000 processes with 1,000 each. Beyond it those of a
 newcomer are not remembered."""
-_MOST_FIGURES_TOLD = 1 << 15
+_MOST_FIGURES_SENT = 1 << 15
 """Figures in the answers to one question, some 10 ms."""
 _MOST_PROCESSES = 4096
 """Number of remembered `Stats`: the holder of a certificate may write under any number of ids."""
@@ -188,7 +188,7 @@ class KeeperService(MemberService):
 
     def _answer_stats(self, asked: Asked) -> None:
         """Answers with the last figures of processes that have ended, as far as one tick has time for them."""
-        left = _MOST_FIGURES_TOLD
+        left = _MOST_FIGURES_SENT
         for (role, id), stats in sorted(self._stats.items()):
             wanted = asked.fields["role"] in ("*", role) and asked.fields["id"] in ("*", id)
             if wanted and not self._roster.is_alive(role, id) and left > 0:

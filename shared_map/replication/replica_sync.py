@@ -45,7 +45,7 @@ _CHANGES_FOR_NS = 2 * NS_PER_S
 """A set that was put is named in digests of changes so often and for this time: of some four, one arrives."""
 _OFFERS_AT_ONCE = 256
 """Sets given to keepers in a period of digests; the next ones show what they still lack."""
-_LOOKS_PER_TICK = 1024
+_COMPARISONS_PER_TICK = 1024
 """Authors whose sets are compared for offers in one tick, some 15 ms: names cost a sender nothing."""
 _TILES_AT_ONCE = map_data.MOST_TILES_ASKED
 """Named in one question: the tiles of a large map are more than a message has room for."""
@@ -206,7 +206,7 @@ class MapSync:
         self.publish(self.replica.tick(now_ns))
         if self._join_due_ns is not None and now_ns >= self._join_due_ns:
             self._join()
-        self._comparisons_left = _LOOKS_PER_TICK
+        self._comparisons_left = _COMPARISONS_PER_TICK
         for pending in self._digests.due(now_ns):
             self._compare(pending, now_ns)
         self._send_digest(now_ns)

@@ -18,7 +18,7 @@ from swarm.client.terrain_frame import Frame
 from swarm.clock import NS_PER_S, Clock
 from swarm.config.explain import choice
 from swarm.errors import BusError, ConfigError, NoAnswerError, ProtocolError, RunMismatchError, SwarmError
-from swarm.grid import quoted, real, whole
+from swarm.grid import brief, real, whole
 from swarm.wire.codec import M, decode, encode
 from swarm.wire.fields import check_id
 from swarm.wire.messages import Message, Nothing
@@ -228,7 +228,7 @@ class Session:
     def checked_call(self, callback: C) -> C:
         """A function to be called. Raises ConfigError, and counts it, on anything else."""
         if not callable(callback):
-            raise self.refused(f"callback is {quoted(callback)}, expected a function")
+            raise self.refused(f"callback is {brief(callback)}, expected a function")
         return callback
 
     def problem(self, kind: str, sentence: str) -> None:

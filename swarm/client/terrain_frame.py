@@ -9,7 +9,7 @@ from textwrap import shorten
 from typing import Any
 
 from swarm.errors import ArgumentError, ConfigError, missing
-from swarm.grid import GridSpec, is_of_earth, quoted, real, whole
+from swarm.grid import GridSpec, brief, is_of_earth, real, whole
 from swarm.places import Given, cell_of, written
 from swarm.wire.messages.processes import RunInfo
 
@@ -134,12 +134,12 @@ def listed(name: str, given: Any) -> list[Any]:
     """The items of a list, array or set. Raises ArgumentError on anything else, such as text; `name` is that of the
     value."""
     if isinstance(given, str | bytes) or not hasattr(given, "__iter__") or getattr(given, "ndim", 1) == 0:
-        raise ArgumentError(f"{name} is {quoted(given)}, expected a list")
+        raise ArgumentError(f"{name} is {brief(given)}, expected a list")
     return list(given)
 
 
 def point(name: str, given: Any) -> Point:
     """The two numbers of a place in metres. Raises ArgumentError on anything else."""
     if len(pair := listed(name, given)) != 2:
-        raise ArgumentError(f"{name} is {quoted(given)}, expected x_m and y_m")
+        raise ArgumentError(f"{name} is {brief(given)}, expected x_m and y_m")
     return real(name, pair[0]), real(name, pair[1])

@@ -15,7 +15,7 @@ from swarm.client.terrain_frame import checked_cell, listed
 from swarm.clock import NS_PER_S
 from swarm.config.scenario import agent_of
 from swarm.errors import ConfigError
-from swarm.grid import TILE_CELLS, GridSpec, joined, quoted
+from swarm.grid import TILE_CELLS, GridSpec, brief, joined
 from swarm.wire.messages import map_data, planning
 from swarm.wire.messages.vehicles import LONGEST_OBSTACLE_LEASE_S, MOST_M_PER_S, MOST_RADIUS_M, Obstacle
 from swarm.wire.route_columns import RouteStatus
@@ -416,7 +416,7 @@ class Vehicle(Reported):
         session = self._session
         for name, flag in (("lethal", lethal), ("clear", clear)):
             if type(flag).__name__ not in ("bool", "bool_"):
-                raise session.refused(f"{name} is {quoted(flag)}, expected True or False")
+                raise session.refused(f"{name} is {brief(flag)}, expected True or False")
         if (lethal, pace_s_per_m is not None, clear).count(True) != 1:
             raise session.refused("mark states one thing: lethal=True, pace_s_per_m=... or clear=True")
         if pace_s_per_m is not None:

@@ -17,7 +17,7 @@ from swarm.clock import NS_PER_S
 from swarm.config.scenario import agent_of
 from swarm.errors import StoreError
 from swarm.grid import REGION_CELLS
-from swarm.right_of_way.holdings import CellRequest, Tell
+from swarm.right_of_way.holdings import CellRequest, SendState
 from swarm.right_of_way.host import GENERATIONS_KEPT, AskKnown, Host
 from swarm.right_of_way.shard_member import Member, MemberAction, Refused, RoundTrips
 from swarm.right_of_way.shards import Shards
@@ -44,7 +44,7 @@ class OwnRecord(msgspec.Struct, frozen=True, kw_only=True, rename=_ON_DISK):
     shard_cells: int = REGION_CELLS
 
 
-Action = MemberAction | Tell | Left | OwnRecord | Known | AskKnown
+Action = MemberAction | SendState | Left | OwnRecord | Known | AskKnown
 
 
 @dataclass

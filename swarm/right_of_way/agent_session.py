@@ -14,7 +14,7 @@ from swarm.clock import NS_PER_S
 from swarm.config.scenario import plan_agents
 from swarm.peers import Peer
 from swarm.right_of_way.agent_core import Action, OwnRecord, RightOfWay
-from swarm.right_of_way.holdings import CellRequest, Tell
+from swarm.right_of_way.holdings import CellRequest, SendState
 from swarm.right_of_way.host import AskKnown
 from swarm.right_of_way.promise_store import PromiseStore
 from swarm.right_of_way.shard_member import SLOW_NS, AskPromises, Refused, Save
@@ -108,7 +108,7 @@ class RightOfWaySync:
     """Shard which had no leader -> from when on the warning is repeated."""
     _reserve_due_ns: int = 0
     _slow_due_ns: int = 0
-    _silent_ns: int | None = None
+    _warned_ns: int | None = None
     """Time of the last warning that our seats are silent; None while they are not."""
 
     def __post_init__(self) -> None:
@@ -247,13 +247,13 @@ class RightOfWaySync:
             self._reserve_due_ns = now_ns + _RESERVE_NS
             self._take_revoked(now_ns)
             why = self.store.reserve()
-            since = self._silent_ns
+            warned_ns = self._warned_ns
             if self.store.ready:
-                if since is not None:
-                    self._silent_ns = None
+                if warned_ns is not None:
+                    self._warned_ns = None
                     self.warn("promises", "promises can be written again: this agent votes on right of way again")
-            elif since is None or now_ns - since >= _SILENT_AGAIN_NS:
-                self._silent_ns = now_ns
+            elif warned_ns is None or now_ns - warned_ns >= _SILENT_AGAIN_NS:
+                self._warned_ns = now_ns
                 self.warn("promises", f"{why}; this agent does not vote on right of way until there is space")
         self.core.silent = not self.store.ready
 
@@ -329,7 +329,7 @@ class RightOfWaySync:
             match action:
                 case AskKnown():
                     self._asked_ns, self._unasked, self._known_tag = None, True, ""  # at the next tick
-                case Tell(members, state):
+                case SendState(members, state):
                     for member in members:
                         self.bus.publish(HOST_STATE, state, shard=state.shard, member=member, agent=self._id)
                 case traffic.Left():

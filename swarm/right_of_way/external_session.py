@@ -22,7 +22,7 @@ from swarm.grid import REGION_CELLS, GridSpec
 from swarm.peers import Peer
 from swarm.right_of_way.external_vehicle import Answers, ExternalVehicle, Removal
 from swarm.right_of_way.generations import MemoryGenerations
-from swarm.right_of_way.holdings import Tell
+from swarm.right_of_way.holdings import SendState
 from swarm.right_of_way.host import AskKnown
 from swarm.right_of_way.shards import Shards
 from swarm.runtime.inbox import Inbox
@@ -193,7 +193,7 @@ class ExternalService:
                     self._ask(now_ns)
                 case Left() as left:
                     self.bus.publish(LEFT, left, host=left.host, agent=self.name)
-                case Tell(members, state):
+                case SendState(members, state):
                     for member in members:
                         self.bus.publish(HOST_STATE, state, shard=state.shard, member=member, agent=self.name)
 

@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from itertools import pairwise
 
 from swarm.clock import NS_PER_S
-from swarm.right_of_way.holdings import MOST_AHEAD, CellRequest, Tell
+from swarm.right_of_way.holdings import MOST_AHEAD, CellRequest, SendState
 from swarm.right_of_way.host import GENERATIONS_KEPT, AskKnown, Host
 from swarm.right_of_way.shards import Shards
 from swarm.wire.fields import MOST_IDS
@@ -60,7 +60,7 @@ class Answers:
         )
 
 
-ExternalAction = AskKnown | Tell | Left
+ExternalAction = AskKnown | SendState | Left
 
 
 _ASIDE = 0.25
@@ -263,5 +263,5 @@ class Removal:
         generations = self.host.begin(sorted(self._generations)[1 - GENERATIONS_KEPT :], chance)
         self.host.begin_as(self.host.generation, generations)  # which has ended, too: no vehicle drives by it
 
-    def tick(self, now_ns: int) -> list[Tell]:
+    def tick(self, now_ns: int) -> list[SendState]:
         return [] if self.host.replaced else self.host.host_states({}, now_ns)

@@ -65,7 +65,7 @@ def part_of(generation: int, grants: Mapping[str, Held], waits: Mapping[str, Seq
 
 
 @dataclass(frozen=True, slots=True)
-class Tell:
+class SendState:
     """Send a host state to these members of its shard."""
 
     members: tuple[str, ...]
@@ -402,7 +402,7 @@ class Holdings:
 
     # --- what to say ----------------------------------------------------------------------------------------
 
-    def host_states(self, requests: Mapping[str, CellRequest], now_ns: int) -> list[Tell]:
+    def host_states(self, requests: Mapping[str, CellRequest], now_ns: int) -> list[SendState]:
         """Returns the statements for each shard that concerns us, if they are new or the last one is a heartbeat
         old. Cells that a statement omits are released."""
         if not self.generation:
@@ -480,7 +480,7 @@ class Holdings:
         for view in self._views.values():
             view.same = False
 
-    def _host_state(self, shard: int, stands: list[Stand], now_ns: int) -> Tell:
+    def _host_state(self, shard: int, stands: list[Stand], now_ns: int) -> SendState:
         """Returns the statement about these, for one leader as changes since one that it has."""
         view, members = self._views[shard], self._listeners(shard, now_ns)
         state = HostState(
@@ -497,7 +497,7 @@ class Holdings:
         base = view.sent.get(view.heard) if members == (view.leader,) else None
         if self.shards.reads_changes(self.name):
             keep_last(view.sent, self._seq, state, STATES_KEPT)
-        return Tell(members, state if base is None else state.changes(base))
+        return SendState(members, state if base is None else state.changes(base))
 
     def _listeners(self, shard: int, now_ns: int) -> tuple[str, ...]:
         view = self._views[shard]

@@ -10,7 +10,7 @@ from support.traffic_world import MS, NS_PER_S, TICK_NS, Disk, Faults, Process, 
 
 from swarm.right_of_way.agent_core import Action, OwnRecord, RightOfWay
 from swarm.right_of_way.external_vehicle import ExternalAction, ExternalVehicle, Removal
-from swarm.right_of_way.holdings import Tell
+from swarm.right_of_way.holdings import SendState
 from swarm.right_of_way.host import AskKnown
 from swarm.wire.messages.traffic import Granted, Known, KnownRequest, Left
 
@@ -72,7 +72,7 @@ class ExternalProcess(Guest):
             match action:
                 case AskKnown():
                     self.world.begin(self)
-                case Tell() | Left():
+                case SendState() | Left():
                     self.perform([action])
 
     def hear_granted(self, granted: Granted) -> None:

@@ -13,7 +13,7 @@ from swarm.clock import NS_PER_S
 from swarm.config.scenario import agent_of
 from swarm.right_of_way.agent_core import Action
 from swarm.right_of_way.cell_orders import Orders
-from swarm.right_of_way.holdings import Tell, part_of
+from swarm.right_of_way.holdings import SendState, part_of
 from swarm.right_of_way.shard_member import AskPromises
 from swarm.wire.messages.traffic import Fence, Granted, Held, HostState, Left, Number, Stored, Table, Word
 
@@ -41,8 +41,8 @@ class Thief(Process):
                 super().perform([action])
             elif isinstance(action, Table):
                 self.tell(self.lied_about(action))
-            elif isinstance(action, Tell):
-                super().perform([Tell((member,), self.misstated(action.state)) for member in action.members])
+            elif isinstance(action, SendState):
+                super().perform([SendState((member,), self.misstated(action.state)) for member in action.members])
             elif isinstance(action, Left):
                 super().perform([replace(action, entries=[*action.entries, *self.world.entries()][:16])])
             elif isinstance(action, Stored):

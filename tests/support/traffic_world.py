@@ -15,7 +15,7 @@ from swarm.grid import GridSpec
 from swarm.peers import Peer
 from swarm.right_of_way.agent_core import Action, OwnRecord, RightOfWay
 from swarm.right_of_way.agent_session import OwnTime
-from swarm.right_of_way.holdings import CellRequest, Tell
+from swarm.right_of_way.holdings import CellRequest, SendState
 from swarm.right_of_way.host import AskKnown
 from swarm.right_of_way.shard_member import AskPromises, Refused, Save
 from swarm.right_of_way.shards import Shards
@@ -127,7 +127,7 @@ class Process:
                 case AskPromises():
                     for member in action.members:
                         self.world.claim(self, action, member)
-                case Tell(members, state):
+                case SendState(members, state):
                     for member in members:
                         self.world.send(self, member, lambda to, s=state: to.rights.hear_host_state(s, to.now_ns))
                 case Table():

@@ -15,7 +15,7 @@ import numpy as np
 
 from swarm.config.vehicle_classes import ClassConfig
 from swarm.grid import GridSpec
-from swarm.plugins import Guard, Nonsense, Plugin, Tell
+from swarm.plugins import Guard, Nonsense, OnFault, Plugin
 from vehicle_agent.driving.motion import Motion, Point, middle_of, way_of
 
 _STRAIGHT_RAD = 1e-9
@@ -106,7 +106,7 @@ class Dynamics(Protocol):
         ...
 
 
-def dynamics_of(plugin: Plugin, world: DynamicsWorld, report: Tell) -> PluginDynamics | None:
+def dynamics_of(plugin: Plugin, world: DynamicsWorld, report: OnFault) -> PluginDynamics | None:
     """The dynamics that a scenario names; None, the default, if vehicles drive as the ground allows.
 
     Raises ConfigError if they cannot be made; `report` is called with a later fault.

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from swarm.grid import GridSpec
-from swarm.plugins import Guard, Nonsense, Plugin, Tell
+from swarm.plugins import Guard, Nonsense, OnFault, Plugin
 from swarm.wire.messages.map_data import PACE_LEAST, PACE_MOST, MarkKind
 
 _TOLERANCE = np.float32(0.01)
@@ -93,7 +93,7 @@ class TruthSensor:
         return Sight(seen, self._truth.reshape(-1)[seen])
 
 
-def sensor_of(plugin: Plugin, world: SensorWorld, report: Tell) -> Sensor:
+def sensor_of(plugin: Plugin, world: SensorWorld, report: OnFault) -> Sensor:
     """The sensor that a scenario names. Raises ConfigError if it cannot be made; `report` takes its later fault."""
     if plugin.factory is None:
         return TruthSensor(world.grid, world.truth_s_per_m, world.range_m)

@@ -15,14 +15,14 @@ from swarm.runtime.tracker_ownership import Trackings
 from swarm.wire.messages.planning import Sighted, TargetPose
 from vehicle_agent.driving.driven_vehicle import Places
 
-_TELL_NS = NS_PER_S // 2
+_REPORT_NS = NS_PER_S // 2
 """Period of the sightings of a target that stays in sight."""
 _RANGE_SHARE = 0.02
 """The uncertainty of a sighting is half a cell and this share of the distance."""
 SIGHTING_LASTS_NS = 30 * NS_PER_S
 """A sighting expires after this time: by then a target may be anywhere within some hundred metres."""
-_IN_SIGHT_NS = 2 * _TELL_NS
-_RETELL_NS = NS_PER_S
+_IN_SIGHT_NS = 2 * _REPORT_NS
+_REPORT_AGAIN_NS = NS_PER_S
 """A planner that appears hears sightings after this time."""
 
 
@@ -87,7 +87,7 @@ class TargetDetector:
     def retell(self, target: str, now_ns: int) -> None:
         """Repeats the last sighting for a planner that has restarted."""
         if target in self._last:
-            self._retell_ns[target] = now_ns + _RETELL_NS
+            self._retell_ns[target] = now_ns + _REPORT_AGAIN_NS
 
     def retold(self, now_ns: int) -> list[Sighted]:
         """Returns the unchanged last sightings whose repetition (`retell`) is due; each is repeated once."""
@@ -98,7 +98,7 @@ class TargetDetector:
 
     def detect(self, places: Places, now_ns: int) -> list[Sighted]:
         """The sightings to publish now: of each target in sight one, by the nearest vehicle."""
-        due = [id for id in self._true if now_ns - self._reported_ns.get(id, -_TELL_NS) >= _TELL_NS]
+        due = [id for id in self._true if now_ns - self._reported_ns.get(id, -_REPORT_NS) >= _REPORT_NS]
         if not due or not places.vehicles:
             return []
         seen = []

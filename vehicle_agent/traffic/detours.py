@@ -20,7 +20,7 @@ from swarm.grid import GridSpec
 from vehicle_agent.driving.driven_vehicle import Vehicle
 from vehicle_agent.traffic.obstacles import Obstacles
 
-_LOOK_CELLS = 200
+_SEARCH_CELLS = 200
 """Cells of the route ahead that are searched for obstacles, and behind an obstacle for where to come back."""
 _CELLS_PER_TICK = 400
 """Expanded by all searches of a host: some 4 ms (docs/design/reported-obstacles.md)."""
@@ -69,7 +69,7 @@ class Detours:
         blocked = {
             each.id: each
             for each in vehicles
-            if not each.in_reach and not standing.isdisjoint(each.route.ahead(_LOOK_CELLS))
+            if not each.in_reach and not standing.isdisjoint(each.route.ahead(_SEARCH_CELLS))
         }
         self._searches = {id: each for id, each in self._searches.items() if id in blocked}
         self._waits = {id: each for id, each in self._waits.items() if id in blocked}
@@ -107,7 +107,7 @@ class Detours:
         """Yields None per expanded cell, and last the cells of the new route, if there is one."""
         route = vehicle.route.ahead()
         first = next(index for index, cell in enumerate(route) if cell in standing)
-        behind = route[first : first + _LOOK_CELLS]
+        behind = route[first : first + _SEARCH_CELLS]
         rest_s, goals = 0.0, {}
         for index in range(len(behind) - 1, -1, -1):
             if behind[index] not in self.obstacles.closed:

@@ -145,8 +145,8 @@ _GHOSTS = 3
 """Places that an obstacle has leapt from and that are still closed, at most."""
 _MOST_SENDERS = 4
 """Lives of one id, of which each may still be there: one that starts again, a second program by mistake."""
-_MOST_TOLD = 1000
-"""Complaints that are remembered, so that each is told once: bounds the memory. Chosen, not measured."""
+_MOST_COMPLAINTS = 1000
+"""Complaints that are remembered, so that each is made once: bounds the memory. Chosen, not measured."""
 _LEAP_M = 5.0
 """Distance beyond the one its speed explains: the error of satellite positions."""
 
@@ -328,7 +328,7 @@ class Obstacles:
     def _complain(self, kind: str, id: str, text: str) -> None:
         self.refused += 1
         about = kind, "" if kind == "crowded" else id  # a crowd has as many ids as it likes
-        if about not in self._warned and len(self._warned) < _MOST_TOLD:
+        if about not in self._warned and len(self._warned) < _MOST_COMPLAINTS:
             self._warned.add(about)
             self.complaints.append(f"obstacle {id} {text}")
 

@@ -23,11 +23,11 @@ _ASK_NS = 2 * NS_PER_S
 _POSITIONS_US = 100_000
 """Interval of positions that is asked for, us: that of reports."""
 _SAY_AGAIN_NS = 60 * NS_PER_S
-"""The minute of `_MOST_SAID`."""
-_MOST_SAID = 64
+"""The minute of `_MOST_SENTENCES`."""
+_MOST_SENTENCES = 64
 """Sentences a minute; a vehicle's own take up a quarter at most."""
 _WARN_NS = 4 * NS_PER_S
-"""Texts of the vehicle are passed on this often at most: 15 a minute, a quarter of `_MOST_SAID`."""
+"""Texts of the vehicle are passed on this often at most: 15 a minute, a quarter of `_MOST_SENTENCES`."""
 _MOST_M_PER_S = 340.0
 """The speed of sound, as `MOST_M_PER_S` of obstacles: hosts refuse the report of a faster one."""
 
@@ -238,7 +238,7 @@ class Adapter:
         if self._is_due("minute", _SAY_AGAIN_NS, now_ns):
             self._sent_this_minute.clear()
         new = [each for each in dict.fromkeys(self._unsent) if each not in self._sent_this_minute]
-        sentences = new[: _MOST_SAID - len(self._sent_this_minute)]
+        sentences = new[: _MOST_SENTENCES - len(self._sent_this_minute)]
         self._sent_this_minute.update(sentences)
         self._unsent.clear()
         return sentences

@@ -279,8 +279,8 @@ def _target_frame(message: Any) -> str | None:
 
 MOST_ROBOTS = 256
 """Robots of one gateway: bounds its memory and the time of a tick. Chosen, not measured."""
-_LOOK_NS = NS_PER_S // 2
-"""Interval of looks at the swarm's own vehicles."""
+_REFRESH_NS = NS_PER_S // 2
+"""Interval at which ids are read of the swarm's own vehicles."""
 _MOST_ASKED = 16
 """All askers get a reply at the next tick, 0.02 s later: more than a few that wait come from a peer that floods,
 and each of them is a copy of the map on the network."""
@@ -362,7 +362,7 @@ class Incoming:
         now_ns  by time.monotonic_ns
         """
         if (self.robots or self._settings.orders) and now_ns >= self._taken_due_ns:
-            self._taken_due_ns = now_ns + _LOOK_NS
+            self._taken_due_ns = now_ns + _REFRESH_NS
             taken = {ros_name(id): id for id in self._vehicles() if agent_of(id) != id}
             self._taken = frozenset(taken)
             for name in taken.keys() - self._sendable if self._settings.orders else ():

@@ -23,7 +23,7 @@ from swarm.config.ground import CostConfig
 from swarm.config.scenario import TargetConfig
 from swarm.errors import TerrainError
 from swarm.grid import STEP_COL, STEP_ROW, GridSpec, Window
-from swarm.plugins import Guard, Nonsense, Plugin, Tell
+from swarm.plugins import Guard, Nonsense, OnFault, Plugin
 
 if TYPE_CHECKING:
     from scipy.sparse import csr_array
@@ -297,7 +297,7 @@ WALKS: Mapping[str, Callable[[WalkWorld], Walk]] = {
 """The built-in walks. The motion of an external target belongs to another process."""
 
 
-def walk_of(plugin: Plugin, world: WalkWorld, report: Tell) -> Walk:
+def walk_of(plugin: Plugin, world: WalkWorld, report: OnFault) -> Walk:
     """The walk that a scenario names. Raises ConfigError if it cannot be made; `report` takes its later fault."""
     if plugin.factory is None:
         return WALKS[plugin.named.name](world)

@@ -6,7 +6,7 @@ import msgspec
 import pytest
 from support.makers import target_pose
 
-from planner_service.tracker_notes import TargetWatch, Tell
+from planner_service.tracker_notes import Notice, TargetWatch
 from swarm.clock import NS_PER_S
 from swarm.grid import GridSpec
 from swarm.runtime.stats import Counters
@@ -25,7 +25,7 @@ class Watch:
         self.watch = TargetWatch("t0", GRID, self.counters)
         self.now_ns = START_NS
         self.seq = 0
-        self.told: list[Tell] = []
+        self.told: list[Notice] = []
 
     def hear(self, tracker: str | None = "radar", row: int = 10, col: int = 20, **changes: Any) -> None:
         self.seq += 1

@@ -10,7 +10,7 @@ from swarm.config.scenario import Scenario
 from swarm.grid import GridSpec
 from swarm.right_of_way.agent_core import Action, OwnRecord, RightOfWay
 from swarm.right_of_way.agent_session import RightOfWaySync
-from swarm.right_of_way.holdings import Tell
+from swarm.right_of_way.holdings import SendState
 from swarm.right_of_way.host import AskKnown
 from swarm.right_of_way.promise_store import PromiseStore
 from swarm.right_of_way.shard_member import AskPromises, Save
@@ -55,7 +55,7 @@ def test_a_silent_leader_sends_no_table_and_its_host_still_tells_where_its_vehic
     rights.silent = True
     said = _through(rights, range(40, 80))
     assert not any(isinstance(action, Table | Save | AskPromises) for action in said)
-    assert any(isinstance(action, Tell) for action in said), "its host goes on"
+    assert any(isinstance(action, SendState) for action in said), "its host goes on"
 
 
 def _through(rights: RightOfWay, ticks: range) -> list[Action]:
@@ -64,7 +64,7 @@ def _through(rights: RightOfWay, ticks: range) -> list[Action]:
     for tick in ticks:
         for action in rights.tick({}, tick * S // 10):
             said.append(action)
-            if isinstance(action, Tell):
+            if isinstance(action, SendState):
                 rights.hear_host_state(action.state, tick * S // 10)
     return said
 
