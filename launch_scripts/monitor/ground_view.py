@@ -25,8 +25,7 @@ from shared_map.cost_map import CostMap
 from shared_map.keeper.zone_orders import cells_of_zones
 from shared_map.replication.replica import MapReplica
 from shared_map.terrain.terrain import Terrain
-from shared_map.terrain.zones import zone_mask
-from swarm.config.ground import ZoneConfig
+from shared_map.terrain.zones import covered_cells
 from swarm.config.scenario import Scenario
 from swarm.config.vehicle_classes import class_numbers
 from swarm.errors import SwarmError
@@ -38,7 +37,8 @@ log = logging.getLogger(__name__)
 
 Rule = Literal["no-go", "slow", "quick", "pace"]
 _RULES: dict[str, Rule] = {
-    "forbidden": "no-go", "water": "no-go", "rough": "slow", "preferred": "quick", "road": "quick", "pace": "pace",
+    "forbidden": "no-go", "keep_in": "no-go", "water": "no-go", "rough": "slow", "preferred": "quick",
+    "road": "quick", "pace": "pace",
 }  # fmt: skip
 _MOST_EDGES = 20_000
 """Sides of texels along a border that is drawn. A zone with more is named, and hatched if closed."""
@@ -288,12 +288,15 @@ def _mesh(tile: MeshTile) -> rr.Mesh3D:
 
 
 def scenario_areas(scenario: Scenario, grid: GridSpec) -> list[Area]:
-    """The zones of a scenario. Roads from files are left out, as the terrain's classes show them; so are files that
-    are not on this machine."""
+    """The zones of a scenario. Roads from files are left out, as the terrain's classes show them; so are large
+    files, and those that are not on this machine."""
     areas = []
     for zone in scenario.cost.zones:
+        path = Path(zone.file or ".")
+        if zone.file and (zone.kind == "road" or not path.exists() or path.stat().st_size > _LARGEST_FILE):
+            continue
         try:
-            cells = _cells_of(zone, grid)
+            cells = np.flatnonzero(covered_cells(zone, grid))
         except SwarmError as error:
             log.warning("a zone is not drawn: %s", error)
             continue
@@ -335,21 +338,6 @@ def title_places(mesh: TerrainMesh, areas: Sequence[Area]) -> Floats:
         apart = (rows - rows.mean()) ** 2 + (cols - cols.mean()) ** 2
         places.append(int(area.cells[int(apart.argmin())]))
     return mesh.place_cells(np.array(places, np.int64), 0.5 * mesh.scale_m)
-
-
-def _cells_of(zone: ZoneConfig, grid: GridSpec) -> NDArray[np.int64]:
-    if zone.file is None:
-        return np.flatnonzero(zone_mask(zone, grid))
-    path = Path(zone.file)
-    if zone.kind == "road" or not path.exists() or path.stat().st_size > _LARGEST_FILE:
-        return np.empty(0, np.int64)
-    from shared_map.importers.zones.zone_files import burn_zone
-
-    burnt = burn_zone(zone, grid, f"zone {zone.called!r}")
-    inside = np.zeros((grid.rows, grid.cols), np.bool_)
-    for window, found in (burnt.lethal, (burnt.values[0], ~np.isnan(burnt.values[1]))):
-        inside[window.row0 : window.row1, window.col0 : window.col1] |= found
-    return np.flatnonzero(inside)
 
 
 def borders(mesh: TerrainMesh, area: Area) -> Floats:

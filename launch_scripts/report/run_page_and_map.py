@@ -252,7 +252,7 @@ def forbidden_cells(scenario: Scenario, terrain: Terrain) -> Bools:
     them again takes long."""
     cells = np.zeros(terrain.pace_s_per_m.shape, np.bool_)
     for zone in scenario.cost.zones:
-        if zone.kind == "forbidden" and zone.file is None:
+        if zone.kind in ("forbidden", "keep_in") and zone.file is None:
             try:
                 cells |= zone_mask(zone, terrain.grid)
             except TerrainError:  # a mask that is not there any more; its cells are lethal all the same

@@ -171,10 +171,8 @@ class _Painter:
             facts.file = burnt.facts
             return _Painted(zone, facts, burnt.values, burnt.lethal, burnt.bridges)
         inside = zone_mask(zone, self._grid, where)
-        if zone.kind == "keep_in":
-            inside = ~inside
-            if not inside.any():
-                return _Painted(zone, facts)
+        if not inside.any():
+            return _Painted(zone, facts)
         rows, cols = np.flatnonzero(inside.any(axis=1)), np.flatnonzero(inside.any(axis=0))
         window = Window(int(rows[0]), int(cols[0]), int(rows[-1]) + 1, int(cols[-1]) + 1)
         inside = inside[_part(window)].copy()
@@ -274,8 +272,8 @@ def files_of_zone(zone: ZoneConfig) -> list[Path]:
 
 
 def zone_mask(zone: ZoneConfig, grid: GridSpec, where: str = "zone") -> Bools:
-    """Cells whose middle lies in the polygon (even-odd), or that are painted in the mask. Raises TerrainError if it
-    covers none."""
+    """Cells whose middle lies in the polygon (even-odd), or that are painted in the mask; of a zone to keep in, all
+    others. Raises TerrainError if polygon or mask cover none."""
     named, side_m = f"{where} {zone.called!r}", grid.resolution_m
     if zone.mask is not None:
         inside, why = mask_of(Path(zone.mask), grid), f"{zone.mask} is 0 everywhere"
@@ -292,4 +290,17 @@ def zone_mask(zone: ZoneConfig, grid: GridSpec, where: str = "zone") -> Bools:
         )
     if not inside.any():
         raise TerrainError(f"{named} covers no cell of the terrain: {why}")
+    return ~inside if zone.kind == "keep_in" else inside
+
+
+def covered_cells(zone: ZoneConfig, grid: GridSpec) -> Bools:
+    """Cells that a zone covers, as in `zone_mask`, and of a file those that its features or its raster cover."""
+    if zone.file is None:
+        return zone_mask(zone, grid)
+    from shared_map.importers.zones.zone_files import burn_zone
+
+    burnt = burn_zone(zone, grid, f"zone {zone.called!r}")
+    inside = np.zeros((grid.rows, grid.cols), np.bool_)
+    for window, found in (burnt.lethal, (burnt.values[0], ~np.isnan(burnt.values[1]))):
+        inside[_part(window)] |= found
     return inside

@@ -3,6 +3,7 @@
 import json
 import math
 from pathlib import Path
+from typing import get_args, get_type_hints
 
 import numpy as np
 import pytest
@@ -53,8 +54,10 @@ from shared_map.pace_measurements import ONE, Measurement
 from shared_map.replication.marks import zone_author
 from shared_map.replication.replica import MapReplica
 from shared_map.terrain.terrain import Terrain, terrain_of_pace
+from shared_map.terrain.zones import paint_zones
 from swarm.bus.bus import Asked, Event
 from swarm.clock import NS_PER_S
+from swarm.config.ground import ZoneConfig
 from swarm.config.scenario import Scenario
 from swarm.config.scenario_files import parse_scenario
 from swarm.grid import GridSpec, Window
@@ -159,6 +162,28 @@ def test_zones_of_a_scenario_are_drawn_by_what_they_do(tmp_path: Path) -> None:
         ("mines: no-go", 16), ("factor: slow", 16), ("preferred: quick", 16), ("lake: no-go", 100)
     ]  # fmt: skip
     assert len(closed_cells(areas)) == 116
+
+
+@pytest.mark.parametrize("kind", [kind for kind in get_args(get_type_hints(ZoneConfig)["kind"]) if kind != "road"])
+@pytest.mark.parametrize("drawn", ["corners", "file"])
+def test_a_zone_is_drawn_where_the_cost_map_has_it(kind: str, drawn: str, tmp_path: Path) -> None:
+    file = tmp_path / "zone.geojson"
+    ring = [[100, -100], [200, -100], [200, -200], [100, -200], [100, -100]]
+    feature = {
+        "type": "Feature",
+        "properties": {"natural": "water"},
+        "geometry": {"type": "Polygon", "coordinates": [ring]},
+    }
+    file.write_text(json.dumps({"type": "FeatureCollection", "features": [feature]}))
+    corners = f"polygon_m = {[[east, -north] for east, north in ring[:4]]}"
+    where = corners if drawn == "corners" else f'file = "{file}"\ncrs = "local"'
+    value = {"factor": "factor = 3.0\n", "pace": "pace_s_per_m = 2.0\n"}.get(kind, "")
+    scenario = zoned(f'[[cost.zones]]\nkind = "{kind}"\n{value}{where}\n')
+    pace = np.array(flat().pace_s_per_m)
+    paint_zones(pace, scenario.cost.zones, flat().grid, scenario.cost)
+    (area,) = scenario_areas(scenario, flat().grid)
+    np.testing.assert_array_equal(area.cells, np.flatnonzero(pace != flat().pace_s_per_m))
+    np.testing.assert_array_equal(closed_cells([area]), np.flatnonzero(np.isinf(pace)))
 
 
 def test_zones_of_operators_are_those_that_stand() -> None:
