@@ -9,11 +9,11 @@ bound of the cost of any route. The planner ensures this in six steps:
 3. *Repair.* Where costs have risen, the subtrees behind are detached and joined again. Lower costs spread
    (`kernels.repair`).
 4. *Move.* The tree is led to the target's new cell: a window around it is grown, then, under an exact strategy, all
-   costs are made exact by the parents (`kernels.costs_from_parents`, or `kernels.tile_pieces` on large maps). If
+   costs are made exact by the parents (`kernels.policy_iteration`, or `kernels.tile_pieces` on large maps). If
    that takes too long for the thread that replies, a worker searches the whole tree. `target_tree.Decision` chooses
    by the row of the strategy (`strategy`) and by the times of searches (`growth_times`).
 5. *Bound.* The costs of an exact tree are their own bounds. Otherwise the last exact costs are a consistent
-   heuristic, lowered with the map, and the last window adds its rim (`tree.route_bounds`,
+   heuristic, lowered with the map, and the last window adds its rim (`tree.routes_with_bounds`,
    docs/method/certificates.md).
 6. *Push.* A follower gets a new route if its old one passes a change or begins in a grown part, and the new one
    differs.
@@ -30,7 +30,7 @@ codec come before step 1.
 6. `tree/cost_to_go.py`: `CostToGoTree.move` grows a window with the kernels. A large exact tree uses
    `tree/partitioned_tree.py` instead.
 7. `followers.py`: `Followers.touch` marks the routes that a change concerns, `due` selects those to push now.
-8. `tree/route_bounds.py`: `read_routes`, called by `TargetTree.routes`, reads new routes with proven bounds.
+8. `tree/routes_with_bounds.py`: `read_routes`, called by `TargetTree.routes`, reads new routes with proven bounds.
 9. `any_angle_routes.py`: `Puller.pull_batch` straightens them if the scenario says so.
 10. `planning_process.py`: `_push`, called by `PlannerService._perform`, publishes each `PushedRoute`.
 

@@ -26,14 +26,14 @@ from typing import Any
 from planner_service.kernels import (
     any_angle_kernels,
     cell_costs,
-    costs_from_parents,
+    dial_growth,
     heap_and_buckets,
     lower_bounds,
+    multilevel_growth,
     parents_from_costs,
     partial_growth_kernels,
     piece_totals,
-    queue_dial,
-    queue_levels,
+    policy_iteration,
     repair,
     route_kernels,
     stride_networks,
@@ -51,13 +51,13 @@ Kernel = Any
 
 FIRST: tuple[Kernel | StepKernel, ...] = (
     route_kernels.walk_routes,
-    StepKernel(queue_dial.grow_by_buckets, None),
-    queue_levels.grow_by_levels,
+    StepKernel(dial_growth.grow_by_buckets, None),
+    multilevel_growth.grow_by_levels,
     parents_from_costs.point_to_parents,
     parents_from_costs.untie_parents,
     StepKernel(route_kernels.point_routes, None),
     StepKernel(partial_growth_kernels.find_aim, None),
-    StepKernel(queue_dial.begin, None),
+    StepKernel(dial_growth.begin, None),
     partial_growth_kernels.open_cells,
     route_kernels.drive_rests,
     lower_bounds.bound_costs,
@@ -68,7 +68,7 @@ FIRST: tuple[Kernel | StepKernel, ...] = (
 compile comes first, so that builders end together."""
 
 LATER: tuple[Kernel | StepKernel, ...] = (
-    costs_from_parents.mend,
+    policy_iteration.mend,
     repair.repair,
     stride_networks.grow_strides,
     cell_costs.cut_window,

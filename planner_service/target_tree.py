@@ -27,7 +27,7 @@ from planner_service.tree.cost_changes import Changes
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
 from planner_service.tree.partial_growth import PartialGrowth
-from planner_service.tree.route_bounds import LowerBounds, read_routes
+from planner_service.tree.routes_with_bounds import LowerBounds, read_routes
 from planner_service.tree.strides import find_strides
 from shared_map.array_files import Floats
 from shared_map.terrain.slope_and_climb import Climb

@@ -23,7 +23,7 @@ in a planner, 19 and 20 in the agent of the other vehicle:
 13. `planner_service/target_tree.py`: `TargetTree.update` learns the new costs.
 14. `planner_service/tree/cost_to_go.py`: `CostToGoTree.repair` repairs the tree.
 15. `planner_service/followers.py`: `Followers.touch` marks the routes that a change concerns, `due` selects them.
-16. `planner_service/tree/route_bounds.py`: `read_routes` reads their new routes.
+16. `planner_service/tree/routes_with_bounds.py`: `read_routes` reads their new routes.
 17. `planner_service/any_angle_routes.py`: `Puller.pull_batch` straightens them if the scenario says so.
 18. `planner_service/planning_process.py`: `PlanningProcess._push` publishes each `PushedRoute`.
 19. `service.py`: `AgentService.tick` takes it from the bus.

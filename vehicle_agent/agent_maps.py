@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from shared_map.array_files import Floats
 from shared_map.cost_map import CostMap, merged
 from shared_map.pace_measurements import Measured, Measurement
-from shared_map.replication.marks import NO_STATEMENTS, Statements, dense, is_zone, standing
+from shared_map.replication.mark_sets import NO_STATEMENTS, Statements, dense, is_zone, standing
 from shared_map.replication.merge import winners
 from shared_map.replication.replica import MapReplica
 from shared_map.replication.tiles import grid_cells, tile_corners

@@ -22,7 +22,7 @@ from swarm.config.vehicle_classes import GROUND, class_named, class_numbers, fli
 from swarm.errors import ConfigError
 from swarm.plugins import named_plugin
 from swarm.right_of_way.agent_core import RightOfWay
-from swarm.right_of_way.agent_session import RightOfWaySync
+from swarm.right_of_way.agent_on_bus import RightOfWaySync
 from swarm.right_of_way.promise_store import PromiseStore
 from swarm.right_of_way.shards import Shards
 from swarm.runtime.membership import Member

@@ -26,7 +26,7 @@ from launch_scripts.typer_commands import command, family_app
 from shared_map.keeper.mark_store import KeeperStore
 from shared_map.learned_factors import learned_kinds, name_of
 from shared_map.pace_measurements import measurements_in
-from shared_map.replication.marks import statements
+from shared_map.replication.mark_sets import statements
 from shared_map.replication.replica import MapReplica
 from shared_map.replication.tiles import beyond_tile, grid_cells, tile_corners
 from shared_map.terrain.map_frame import MapFrame

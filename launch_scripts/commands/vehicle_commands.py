@@ -18,7 +18,7 @@ from swarm.config.scenario import agent_of
 from swarm.errors import BusError, ConfigError
 from swarm.grid import GridSpec
 from swarm.places import read_place
-from swarm.right_of_way.external_session import say_gone
+from swarm.right_of_way.external_on_bus import say_gone
 from swarm.runtime.operator import replies_to
 from swarm.wire.messages.orders import Then
 from swarm.wire.messages.vehicles import Removed, RemoveVehicles

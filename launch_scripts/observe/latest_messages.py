@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from launch_scripts.observe.summed_counts import Counts, sum_of
 from shared_map.replication.author_limits import Capacity
 from shared_map.replication.held_sets import HeldSets
-from shared_map.replication.marks import is_tombstone
+from shared_map.replication.mark_sets import is_tombstone
 from shared_map.replication.merge import TileChange, new_winners
 from swarm.clock import NS_PER_S
 from swarm.config.scenario import Scenario, agent_of, crew_of

@@ -3,5 +3,5 @@
 `cost_grid` is the map in the layout of kernels, `cost_changes` its changes. A tree has a cost in every cell
 (`cost_to_go`) or is cut into pieces (`partitioned_tree`). `queue_choice` grows it, or a window of it, by the queue
 that suits the costs, `partial_growth` only as far as its askers; `strides` thins it out far from its root;
-`route_bounds` reads routes from it with their bounds.
+`routes_with_bounds` reads routes from it with their bounds.
 """

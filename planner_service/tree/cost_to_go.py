@@ -18,10 +18,10 @@ from numpy.typing import NDArray
 from planner_service.kernels import stride_networks
 from planner_service.kernels.cell_costs import cut_window, find_rim, merge_window
 from planner_service.kernels.climbs import climbs_in
-from planner_service.kernels.costs_from_parents import Walk, make_walk, mend
 from planner_service.kernels.layout import NONE, Labels, PaddedGrid, step_offsets
 from planner_service.kernels.lower_bounds import WindowBound
 from planner_service.kernels.parents_from_costs import point_to_parents
+from planner_service.kernels.policy_iteration import Walk, make_walk, mend
 from planner_service.kernels.repair import repair
 from planner_service.kernels.route_kernels import point_routes
 from planner_service.kernels.stride_networks import StrideNetwork

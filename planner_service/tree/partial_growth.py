@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from planner_service.kernels import queue_dial
+from planner_service.kernels import dial_growth
 from planner_service.kernels.layout import NONE, TOO_FINE, WALL
 from planner_service.kernels.partial_growth_kernels import find_aim, stays_exact
 from planner_service.kernels.route_kernels import point_routes
@@ -81,7 +81,7 @@ class PartialGrowth:
     def __init__(self, cost_grid: CostGrid) -> None:
         self._grid = cost_grid
         self._width, self._circle = 0.0, 0
-        self._scratch: queue_dial.Scratch | None = None
+        self._scratch: dial_growth.Scratch | None = None
         self._state = np.zeros(5, np.int64)
         self._mark = np.zeros(cost_grid.size, np.uint8)
         self.cost: Floats = np.empty(0, np.float32)
@@ -117,7 +117,7 @@ class PartialGrowth:
     def begin(self, root: int) -> None:
         """Begins the tree of a padded, passable root."""
         touched, *_ = self._room()
-        queue_dial.begin(self.cost, touched, self._state, root)
+        dial_growth.begin(self.cost, touched, self._state, root)
         self.root, self.bound = root, 0.0
 
     def resume(self, tree: CutTree, level: float) -> None:
@@ -143,13 +143,13 @@ class PartialGrowth:
         self._state[:] = first - 1, 0, np.count_nonzero(inner), cells.size, 0
         self.root, self.bound = tree.root, self.reach
 
-    def aim_at(self, askers: Cells, root: int, parent: NDArray[np.uint8]) -> queue_dial.Aim:
+    def aim_at(self, askers: Cells, root: int, parent: NDArray[np.uint8]) -> dial_growth.Aim:
         """Returns the aim of the next growth, from a padded, passable root to such cells, which it sorts. None
         costs more than along the parents to a cell beside that root, or over the tree in hand and its root. Where
         neither is known, no cells are left out."""
         grid, between = self._grid, math.inf
         if not askers.size:
-            return queue_dial.NO_AIM
+            return dial_growth.NO_AIM
         if self.root >= 0 and self.bound >= 0:
             back = float(grid.cell_cost[root] + self.cost[root] - grid.cell_cost[self.root])
             between = back * grid.dearest_step
@@ -158,7 +158,7 @@ class PartialGrowth:
         most = find_aim(grid.padded, cost, parent, askers, root, known, boxes)
         return grid.lowest_cell_cost, most, boxes
 
-    def go_on(self, askers: Cells, most: int, aim: queue_dial.Aim = queue_dial.NO_AIM) -> int:
+    def go_on(self, askers: Cells, most: int, aim: dial_growth.Aim = dial_growth.NO_AIM) -> int:
         """Grows until these padded, passable cells have a cost, `most` more cells have one, or no cell is left.
         Returns how many more have one; -1 if costs became too large for float32: then a whole growth is left.
 
@@ -169,7 +169,7 @@ class PartialGrowth:
         assert self._scratch is not None
         before, buckets = self.touched, (self._width, self._circle)
         grown = self._grid.padded, self.cost, buckets, self._scratch, self._state
-        last = queue_dial.grow_by_buckets(*grown, askers, most, aim)
+        last = dial_growth.grow_by_buckets(*grown, askers, most, aim)
         if last == TOO_FINE:
             return -1
         self._find_bound()
@@ -192,7 +192,7 @@ class PartialGrowth:
     def forget(self) -> None:
         """There is no tree in hand any more. The work follows the size of the tree."""
         if self._scratch is not None:
-            queue_dial.begin(self.cost, self._scratch[0], self._state, -1)
+            dial_growth.begin(self.cost, self._scratch[0], self._state, -1)
         self.root = -1
 
     def learn(self, changes: Changes) -> None:
@@ -201,7 +201,7 @@ class PartialGrowth:
             self.bound = -1.0
             self.cost[changes.cells] = np.where(changes.after < np.inf, np.float32(np.inf), WALL)
 
-    def _room(self) -> queue_dial.Scratch:
+    def _room(self) -> dial_growth.Scratch:
         """Returns room for a tree on the map as it is now."""
         width = self._narrow
         if not self.cost.size:
@@ -210,7 +210,7 @@ class PartialGrowth:
             self._width = width
             self._circle = 1 << max(2, math.ceil(math.log2(self._needed(width))))
             self.forget()
-            self._scratch = queue_dial.make_scratch(self._grid.size, self._grid.rule, self._circle)
+            self._scratch = dial_growth.make_scratch(self._grid.size, self._grid.rule, self._circle)
         return self._scratch
 
     def stays(self, tree: CutTree, changes: Changes, route: Cells) -> tuple[float, bool]:

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from planner_service.kernels import queue_dial, queue_levels
+from planner_service.kernels import dial_growth, multilevel_growth
 from planner_service.kernels.climbs import Climbs
 from planner_service.kernels.layout import TOO_FINE, PaddedGrid
 from planner_service.kernels.parents_from_costs import point_to_parents, untie_parents
@@ -60,8 +60,8 @@ def grow_tree(
     reach = None if climbs is not None else _grow_narrow(padded, bounds, root, cost, scratch_of)
     if reach is None:
         width, may_lead_back = _finest_width(cell_cost, *bounds[:2])
-        scratch = _scratch(scratch_of, (size, 0), lambda: queue_levels.make_scratch(size))
-        queue_levels.grow_by_levels(padded, climbs, cost, root, width, may_lead_back, scratch)
+        scratch = _scratch(scratch_of, (size, 0), lambda: multilevel_growth.make_scratch(size))
+        multilevel_growth.grow_by_levels(padded, climbs, cost, root, width, may_lead_back, scratch)
         reach = math.inf if parent is None else CostRange(cost).highest
     if parent is None:
         return reach
@@ -81,9 +81,9 @@ def _grow_narrow(padded: PaddedGrid, bounds: Bounds, root: int, cost: Floats, ke
     if needed > MOST_BUCKETS:
         return None
     count = 1 << max(2, math.ceil(math.log2(needed)))
-    scratch = _scratch(kept, (size, count), lambda: queue_dial.make_scratch(size, rule, count))
-    state, at_once = np.empty(5, np.int64), (np.array((root,)), queue_dial.WHOLE, queue_dial.NO_AIM)
-    last = int(queue_dial.grow_by_buckets(padded, cost, (width, count), scratch, state, *at_once))
+    scratch = _scratch(kept, (size, count), lambda: dial_growth.make_scratch(size, rule, count))
+    state, at_once = np.empty(5, np.int64), (np.array((root,)), dial_growth.WHOLE, dial_growth.NO_AIM)
+    last = int(dial_growth.grow_by_buckets(padded, cost, (width, count), scratch, state, *at_once))
     return None if last == TOO_FINE else (last + 1) * width
 
 
@@ -99,11 +99,11 @@ def _finest_width(cell_cost: Floats, lowest: float, highest: float) -> tuple[flo
         rank = int(sample.size * _RARE)
         usual = float(np.partition(sample, rank)[rank]) if sample.size else lowest
         if usual > _NEAR * lowest:
-            width = usual * queue_levels.WIDTH
+            width = usual * multilevel_growth.WIDTH
             while width > lowest:
-                width /= 1 << queue_levels.BASE_BITS
+                width /= 1 << multilevel_growth.BASE_BITS
             return width, True
-    return lowest * queue_levels.WIDTH, False
+    return lowest * multilevel_growth.WIDTH, False
 
 
 def _scratch(kept: KeptScratch, key: tuple[int, int], make: Callable[[], Any]) -> Any:

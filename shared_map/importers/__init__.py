@@ -9,11 +9,12 @@ is known by how it begins. Guarantees of each reader:
 4. Nothing is guessed. If a file may have several meanings, the error names the setting that decides.
 5. Changes to the data are listed in `Source.notes`.
 
-`raster_files` opens and guards all rasters; those which GDAL does not read, or not as they are, become datasets
-in memory: those of `plain_grids`, which has maps without heights, too. `height_rasters` tells what a raster holds;
-`georeference` says where it lies, and brings it onto the grid.
-`water_and_voids` finds water and voids in a file's own cells, before anything is resampled. Land cover and photos
-are in `cover`, vector zones in `zones`; codes, colours and classes of ways are data beside their readers.
+`gdal_rasters` opens and guards all rasters; those which GDAL does not read, or not as they are, become datasets
+in memory: those of `grids_without_gdal`, which has maps without heights, too. `height_rasters` tells what a raster
+holds; `georeference` says where it lies, and brings it onto the grid. `undo_resampling` finds the survey's cells in
+a file that was made finer; `water_and_voids` finds water and voids in a file's own cells, before anything is
+resampled. Land cover and photos are in `cover`, vector zones in `zones`; codes, colours and classes of ways are
+data beside their readers.
 """
 
 from swarm.errors import require

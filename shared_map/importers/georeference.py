@@ -24,7 +24,7 @@ from rasterio.warp import Resampling, transform_bounds
 from rasterio.warp import transform as to_crs
 
 from shared_map.array_files import Floats
-from shared_map.importers.raster_files import READ_ROWS
+from shared_map.importers.gdal_rasters import READ_ROWS
 from shared_map.terrain.row_bands import Progress, bands, no_progress
 from swarm.config.input_files import FileKind, read_text
 from swarm.errors import TerrainError

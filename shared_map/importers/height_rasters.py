@@ -19,8 +19,8 @@ from rasterio.transform import Affine, from_origin
 
 from shared_map.importers.cover import land_cover
 from shared_map.importers.cover.land_cover import TABLES, some
+from shared_map.importers.gdal_rasters import NOTES, Numbers, in_memory, middle_of, opened, sampled
 from shared_map.importers.georeference import METRES, Placed, check_metres, crs_of, overruled, own_system, plan_grid
-from shared_map.importers.raster_files import NOTES, Numbers, in_memory, middle_of, opened, sampled
 from shared_map.importers.terrain_sources import Source
 from shared_map.importers.water_and_voids import MOST_SAMPLED, examined, voids_as_nan
 from shared_map.terrain.row_bands import Progress

@@ -12,7 +12,7 @@ import msgspec
 import numpy as np
 
 from shared_map.array_files import Bools, Bytes, Floats
-from shared_map.importers.raster_files import DRIVERS_BY_ENDING, PLAIN, Numbers, is_named, is_raster
+from shared_map.importers.gdal_rasters import DRIVERS_BY_ENDING, PLAIN, Numbers, is_named, is_raster
 from shared_map.terrain.pace_layers import TerrainClass
 from shared_map.terrain.row_bands import Progress, no_progress
 from swarm.config.ground import TerrainConfig
@@ -147,9 +147,9 @@ def _map(path: Path, config: TerrainConfig) -> Source:
     """A map without heights: level, with the pace that the file states."""
     from rasterio.transform import from_origin
 
-    from shared_map.importers import plain_grids
+    from shared_map.importers import grids_without_gdal
 
-    found: Numbers = getattr(plain_grids, _FLAT_MAPS[path.suffix.lower()])(path)
+    found: Numbers = getattr(grids_without_gdal, _FLAT_MAPS[path.suffix.lower()])(path)
     side_m = config.resolution_m or 1.0
     place = found.transform or from_origin(0.0, 0.0, side_m, side_m)
     resolution_m = float(place.a)
@@ -163,7 +163,7 @@ def _map(path: Path, config: TerrainConfig) -> Source:
 
 
 _FLAT_MAPS = {".map": "read_map", ".yaml": "read_ros", ".yml": "read_ros"}
-"""Endings of maps without heights -> their reader in `plain_grids`."""
+"""Endings of maps without heights -> their reader in `grids_without_gdal`."""
 _ENDINGS = (*DRIVERS_BY_ENDING, ".zip", *PLAIN, *_FLAT_MAPS)
 """Endings of terrains; a raster of any other name is known by how it begins."""
 FILE_KINDS = ", ".join(_ENDINGS)

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shared_map.array_files import Bools, Floats
-from shared_map.importers.survey_cells import surveyed
+from shared_map.importers.undo_resampling import surveyed
 from shared_map.terrain.row_bands import neighbours
 from swarm.config.ground import TerrainConfig
 

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shared_map.replication.digest import Ledger
-from shared_map.replication.marks import Statements, base_seq, mark_set, next_expiry_ns, statements, taken
+from shared_map.replication.mark_sets import Statements, base_seq, mark_set, next_expiry_ns, statements, taken
 from swarm.wire.messages.map_data import DIGEST_ROW, FOREVER, SEQ_STEP, TILE_AREA, MarkKind, MarkSet
 
 _MOST_AUTHORS = 1 << 14

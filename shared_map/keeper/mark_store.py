@@ -13,7 +13,7 @@ import msgspec
 from shared_map.keeper.compaction import united, without
 from shared_map.keeper.sealed_database import META, SealedDatabase, Table
 from shared_map.replication.digest import Ledger
-from shared_map.replication.marks import base_seq, is_tombstone
+from shared_map.replication.mark_sets import base_seq, is_tombstone
 from swarm.errors import StoreError
 from swarm.grid import GridSpec
 from swarm.recording.service_boundary import ExternalCalls

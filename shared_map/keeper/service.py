@@ -14,7 +14,7 @@ from shared_map.keeper.compaction import CompactionPlan, compact
 from shared_map.keeper.mark_store import Keeper, KeeperStore
 from shared_map.keeper.order_service import KeptOrders
 from shared_map.keeper.zone_orders import free_name, rows_of, zone_sets, zones_of
-from shared_map.replication.marks import is_zone, standing
+from shared_map.replication.mark_sets import is_zone, standing
 from shared_map.replication.replica import MapReplica
 from shared_map.replication.replica_sync import MapSync
 from shared_map.replication.tiles import beyond_tile

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shared_map.array_files import Bools
-from shared_map.replication import marks
+from shared_map.replication import mark_sets
 from shared_map.replication.author_limits import MAX_MARKS
 from shared_map.replication.digest import digest_rows
 from shared_map.replication.replica import MapReplica
@@ -58,9 +58,9 @@ def zone_sets(
     if order.vehicle_class is not None and order.vehicle_class not in numbers:
         known = f"there are {', '.join(numbers)}" if numbers else "the scenario has no [[classes]]"
         return f"vehicle_class: there is no class {order.vehicle_class!r} beside that of [cost]; {known}"
-    author = marks.zone_author(order.name)
+    author = mark_sets.zone_author(order.name)
     tiles = {tile: each for tile in replica.held.tiles if (each := replica.held.get(tile, author)) is not None}
-    by_tile: dict[int, marks.Statements] = {}
+    by_tile: dict[int, mark_sets.Statements] = {}
     if order.action == "add":
         inside = _mask(order, terrain)
         if isinstance(inside, str):
@@ -71,7 +71,7 @@ def zone_sets(
         by_tile = _by_tile(
             order, inside, replica, now_ns, 0 if order.vehicle_class is None else numbers[order.vehicle_class]
         )
-    elif not any(len(marks.standing(each, now_ns).cells) for each in tiles.values()):
+    elif not any(len(mark_sets.standing(each, now_ns).cells) for each in tiles.values()):
         return f"there is no zone {order.name!r}; {_names(replica, now_ns)}"
     sets: list[MarkSet] = []
     for tile in sorted(tiles.keys() | by_tile.keys()):
@@ -79,15 +79,15 @@ def zone_sets(
         number = _above(max(used, default=(1, 0)), now_ns)
         if number is None:
             return f"zone {order.name!r}: its number on tile {tile} cannot grow; give the zone another name"
-        stated = by_tile.get(tile, marks.NO_STATEMENTS)
-        sets.append(marks.mark_set(author, author.partition(".")[0], tile, *number, stated))
+        stated = by_tile.get(tile, mark_sets.NO_STATEMENTS)
+        sets.append(mark_sets.mark_set(author, author.partition(".")[0], tile, *number, stated))
     return sets
 
 
 def free_name(replica: MapReplica) -> str:
     """A name that no zone has or had: z1, z2, ..."""
-    taken = {author for author in replica.held.ledger.authors if marks.is_zone(author)}
-    return next(name for n in itertools.count(1) if marks.zone_author(name := f"z{n}") not in taken)
+    taken = {author for author in replica.held.ledger.authors if mark_sets.is_zone(author)}
+    return next(name for n in itertools.count(1) if mark_sets.zone_author(name := f"z{n}") not in taken)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -109,7 +109,7 @@ def cells_of_zones(replica: MapReplica, now_ns: int) -> dict[str, ZoneCells]:
     cells: dict[str, list[NDArray[np.int64]]] = {}
     rules: dict[str, tuple[int, float, int, int]] = {}
     for each in _zone_sets(replica):
-        stated = marks.standing(each, now_ns)
+        stated = mark_sets.standing(each, now_ns)
         if not len(stated.cells):
             continue
         inside = grid_cells(replica.grid, tile_corners(replica.grid, each.tile), stated.cells)
@@ -156,7 +156,7 @@ def rows_of(sets: Sequence[MarkSet]) -> bytes:
 
 def _zone_sets(replica: MapReplica) -> Iterator[MarkSet]:
     for tile in replica.held.tiles:
-        yield from (each for each in replica.held.of_tile(tile) if marks.is_zone(each.author))
+        yield from (each for each in replica.held.of_tile(tile) if mark_sets.is_zone(each.author))
 
 
 def _names(replica: MapReplica, now_ns: int) -> str:
@@ -209,23 +209,25 @@ def _mask(order: ZoneOrder, terrain: Terrain) -> Bools | str:
 
 def _by_tile(
     order: ZoneOrder, inside: Bools, replica: MapReplica, now_ns: int, class_number: int
-) -> dict[int, marks.Statements]:
+) -> dict[int, mark_sets.Statements]:
     """The statements of a zone, by tile: newer than those of all zones that are there."""
     tiles, cells = tile_cells(replica.grid, np.flatnonzero(inside))
     kind, pace = MarkKind.LETHAL, 0.0
     if order.pace_s_per_m is not None:
         kind, pace = MarkKind.PACE, order.pace_s_per_m
-    found: dict[int, marks.Statements] = {}
+    found: dict[int, mark_sets.Statements] = {}
     for tile in np.unique(tiles).tolist():
         here = np.sort(cells[tiles == tile])
         own = replica.grid.tile_for(tile, class_number)
-        known = [each.stamps_ns for each in replica.held.of_tile(own) if marks.is_zone(each.author) and each.kinds]
+        known = [
+            each.stamps_ns for each in replica.held.of_tile(own) if mark_sets.is_zone(each.author) and each.kinds
+        ]
         newest_ns = max((int(column(stamps, "<i8").max()) for stamps in known), default=0)
         stamp_ns = min(max(now_ns, newest_ns + 1), STAMP_LIMIT_NS - 1)
         untils_ns = None
         if order.lasts_s is not None:
             untils_ns = np.full(len(here), now_ns + int(order.lasts_s * NS_PER_S), np.int64)
-        found[own] = marks.Statements(
+        found[own] = mark_sets.Statements(
             here,
             np.full(len(here), kind, np.uint8),
             np.full(len(here), pace, np.float32),
@@ -238,7 +240,7 @@ def _by_tile(
 def _above(number: tuple[int, int], now_ns: int) -> tuple[int, int] | None:
     """The next number after this one. The clock is in it, as the number of a tombstone may be forgotten."""
     epoch, seq = number
-    following = max(marks.next_seq(seq), now_ns - now_ns % SEQ_STEP)
+    following = max(mark_sets.next_seq(seq), now_ns - now_ns % SEQ_STEP)
     if following < _LIMIT:
         return epoch, following
     return (epoch + 1, 0) if epoch + 1 < _LIMIT else None

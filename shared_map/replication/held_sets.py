@@ -9,7 +9,7 @@ import numpy as np
 from shared_map.pace_measurements import measurements_in
 from shared_map.replication.author_limits import Capacity
 from shared_map.replication.digest import Held, Ledger, Place, fingerprint
-from shared_map.replication.marks import fault, is_tombstone, is_zone, supersedes
+from shared_map.replication.mark_sets import fault, is_tombstone, is_zone, supersedes
 from swarm.clock import NS_PER_S
 from swarm.config.vehicle_classes import MOST_CLASSES
 from swarm.grid import TILE_CELLS, GridSpec

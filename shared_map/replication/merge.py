@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from shared_map.replication.marks import NO_STATEMENT, NO_STATEMENTS, Statements, is_zone
+from shared_map.replication.mark_sets import NO_STATEMENT, NO_STATEMENTS, Statements, is_zone
 from shared_map.replication.tiles import grid_cells, tile_corners
 from swarm.grid import TILE_CELLS, GridSpec
 from swarm.wire.fields import column

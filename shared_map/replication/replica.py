@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from shared_map.pace_measurements import Measurement, columns_of
-from shared_map.replication import marks
+from shared_map.replication import mark_sets
 from shared_map.replication.author_limits import Capacity
 from shared_map.replication.digest import Held
 from shared_map.replication.held_sets import HeldSets
@@ -95,7 +95,7 @@ class MapReplica:
             None  # when to look again at words that came too soon; None: there are none
         )
         self._learned_ns = -_LEARN_EVERY_NS  # when words last changed the cost map
-        self._clock = marks.HybridClock()
+        self._clock = mark_sets.HybridClock()
         self._publish_ns = int(NS_PER_S / publish_hz)
         self._pending: dict[int, None] = {}  # own tiles whose newest set has not been published, in order
         self._published_ns: dict[int, int] = {}  # own tile -> when its set was published last
@@ -124,7 +124,7 @@ class MapReplica:
                 self._reassert(each)
                 continue
             sets = before[tile] if tile in before else self.held.of_tile(tile)
-            if not each.kinds and marks.is_tombstone(each):
+            if not each.kinds and mark_sets.is_tombstone(each):
                 self.held.delete(each, self._now_ns)
             elif not self.held.put(each):
                 self.counts["sets_without_room"] += 1
@@ -138,7 +138,7 @@ class MapReplica:
         if not taken:
             return Merged([], [])
         self.counts["sets_merged"] += len(taken)
-        self.zones_version += any([marks.is_zone(each.author) for each in taken])  # noqa: C419 - twice as fast
+        self.zones_version += any([mark_sets.is_zone(each.author) for each in taken])  # noqa: C419 - twice as fast
         counts = self._settle(before, self._now_ns, measured)
         if len(before) == len(taken):
             return Merged(taken, counts)
@@ -147,7 +147,7 @@ class MapReplica:
 
     def _admits(self, received: MarkSet, held: MarkSet | None) -> bool:
         """Returns True if a set is part of this map, wanted and new; counts the reason if not."""
-        if self.held.off_grid(received) or marks.is_ahead(received, self._now_ns):
+        if self.held.off_grid(received) or mark_sets.is_ahead(received, self._now_ns):
             self.counts["sets_refused"] += 1
             return False
         if received.author != self.author:
@@ -187,7 +187,7 @@ class MapReplica:
                 self._cost_map.apply(won.cells, won.kinds, won.paces, class_number)
             if measured:
                 newest_ns = int(won.stamps_ns.max())
-                if newest_ns != marks.NO_STATEMENT and (self._newest_ns is None or newest_ns > self._newest_ns):
+                if newest_ns != mark_sets.NO_STATEMENT and (self._newest_ns is None or newest_ns > self._newest_ns):
                     self._newest_ns = newest_ns
         return won.counts
 
@@ -258,7 +258,7 @@ class MapReplica:
 
     def _await_expiry(self, tile: int, sets: Iterable[MarkSet]) -> None:
         """Checks a tile again when the next statement of these sets expires."""
-        ends = [end_ns for each in sets if (end_ns := marks.next_expiry_ns(each, self._now_ns)) is not None]
+        ends = [end_ns for each in sets if (end_ns := mark_sets.next_expiry_ns(each, self._now_ns)) is not None]
         if ends:
             self._expiry_ns[tile] = min(*ends, self._expiry_ns.get(tile, FOREVER))
             self._soonest_ns = min(self._soonest_ns, self._expiry_ns[tile])
@@ -271,7 +271,7 @@ class MapReplica:
         expired = {tile: self.held.of_tile(tile) for tile, at_ns in self._expiry_ns.items() if at_ns <= now_ns}
         self._expiry_ns = {tile: at_ns for tile, at_ns in self._expiry_ns.items() if tile not in expired}
         self._soonest_ns = min(self._expiry_ns.values(), default=FOREVER)
-        self.zones_version += any(marks.is_zone(each.author) for sets in expired.values() for each in sets)
+        self.zones_version += any(mark_sets.is_zone(each.author) for sets in expired.values() for each in sets)
         self._settle(expired, before_ns, False)
         for tile, sets in expired.items():
             self._await_expiry(tile, sets)
@@ -311,40 +311,40 @@ class MapReplica:
         now_ns: int,
     ) -> None:
         own = self._own(tile)
-        won = marks.dense(winners(self.held.of_tile(tile), self._now_ns))
+        won = mark_sets.dense(winners(self.held.of_tile(tile), self._now_ns))
         stamps = self._clock.stamps_ns(now_ns, won.stamps_ns[cells])
         if len(np.unique(cells)) == len(cells):
             # A mark that we have stated already, and that wins, need not be stated again.
-            wins = (own.stamps_ns[cells] != marks.NO_STATEMENT) & (own.stamps_ns[cells] == won.stamps_ns[cells])
+            wins = (own.stamps_ns[cells] != mark_sets.NO_STATEMENT) & (own.stamps_ns[cells] == won.stamps_ns[cells])
             known = wins & (won.kinds[cells] == kinds) & (won.paces[cells] == paces)
             if known.all():
                 return
             cells, kinds, paces, stamps = cells[~known], kinds[~known], paces[~known], stamps[~known]
         own.kinds[cells], own.paces[cells], own.stamps_ns[cells] = kinds, paces, stamps
         self.counts["marks_written"] += len(cells)
-        self._put_own(tile, marks.sparse(own))
+        self._put_own(tile, mark_sets.sparse(own))
 
     def write_learned(self, measured: Mapping[int, Measurement], now_ns: int) -> list[MarkSet]:
         """Publishes our measurements (`shared_map.learned_factors`) instead of the previous ones."""
-        self._put_own(beyond_tile(self.grid), marks.Statements(*columns_of(measured, now_ns)))
+        self._put_own(beyond_tile(self.grid), mark_sets.Statements(*columns_of(measured, now_ns)))
         return self.tick(now_ns)
 
-    def _own(self, tile: int) -> marks.Statements:
+    def _own(self, tile: int) -> mark_sets.Statements:
         """Our statements about a tile, spread over all of its cells."""
         if self.author is None:
             raise RuntimeError("a replica without an author cannot write")
         own = self.held.get(tile, self.author)
-        return marks.dense(marks.NO_STATEMENTS if own is None else marks.statements(own))
+        return mark_sets.dense(mark_sets.NO_STATEMENTS if own is None else mark_sets.statements(own))
 
-    def _put_own(self, tile: int, stated: marks.Statements, epoch: int | None = None) -> None:
+    def _put_own(self, tile: int, stated: mark_sets.Statements, epoch: int | None = None) -> None:
         """Replaces our set of a tile, under the next number.
 
         epoch  of that number; None: as before
         """
         assert self.author is not None
         held = self.held.get(tile, self.author)
-        last, seq = (1, 0) if held is None else (held.epoch, marks.next_seq(held.seq))
-        own = marks.mark_set(self.author, self.group, tile, last if epoch is None else epoch, seq, stated)
+        last, seq = (1, 0) if held is None else (held.epoch, mark_sets.next_seq(held.seq))
+        own = mark_sets.mark_set(self.author, self.group, tile, last if epoch is None else epoch, seq, stated)
         before = {tile: self.held.of_tile(tile)}
         self.held.put(own, own=True)
         self.counts["sets_merged"] += 1
@@ -358,7 +358,7 @@ class MapReplica:
             self.counts["sets_refused"] += 1
             return
         held = self.held.get(received.tile, self.author)
-        stated = marks.NO_STATEMENTS if held is None else marks.statements(held)
+        stated = mark_sets.NO_STATEMENTS if held is None else mark_sets.statements(held)
         self._put_own(received.tile, stated, received.epoch + 1)
 
     # --- comparing with others ------------------------------------------------------------------------------
@@ -376,13 +376,13 @@ class MapReplica:
         """Returns True if all marks of an author in some tile have expired: too early if our clock is ahead of
         its."""
         sets = (self.held.get(tile, author) for tile in self.held.tiles)
-        return any(each and each.kinds and not len(marks.standing(each, self._now_ns).cells) for each in sets)
+        return any(each and each.kinds and not len(mark_sets.standing(each, self._now_ns).cells) for each in sets)
 
     def own_digest(self) -> dict[str, bytes]:
         """Rows of all that we stated ourselves."""
         return self.held.ledger.held([] if self.author is None else [self.author])
 
-    def winners(self, tile: int) -> marks.Statements:
+    def winners(self, tile: int) -> mark_sets.Statements:
         """The winning statements about a tile, in order of cell; cells without any are absent."""
         return winners(self.held.of_tile(tile), self._now_ns)
 

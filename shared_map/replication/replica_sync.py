@@ -15,7 +15,7 @@ from msgspec.structs import replace
 from shared_map.replication.author_limits import Quota
 from shared_map.replication.digest import PendingDigest, PendingDigests, Place, parts_of
 from shared_map.replication.interest import DigestInterest
-from shared_map.replication.marks import packed, unpacked
+from shared_map.replication.mark_sets import packed, unpacked
 from shared_map.replication.replica import MapReplica, Merged
 from shared_map.replication.tiles import beyond_region, beyond_tile, of_all_classes, region_of, region_tiles
 from swarm.bus.bus import Asked, AskEnded, Bus, Event, LinkChanged, Post, Replied

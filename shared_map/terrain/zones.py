@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from shared_map.array_files import Bools, Bytes, Floats
-from shared_map.importers.raster_files import mask_of
+from shared_map.importers.gdal_rasters import mask_of
 from shared_map.terrain.map_frame import MapFrame
 from shared_map.terrain.pace_layers import LETHAL, TerrainClass, polygon_mask
 from swarm.config.ground import CostConfig, ZoneConfig

@@ -32,7 +32,7 @@ from swarm.wire.versions import are_neighbours
 
 if TYPE_CHECKING:
     from swarm.bus.zenoh_bus import ZenohBus
-    from swarm.right_of_way.external_session import ExternalSession
+    from swarm.right_of_way.external_on_bus import ExternalSession
     from swarm.runtime.inbox import Inbox
 
 
@@ -259,7 +259,7 @@ class Swarm:
     def _external(self, id: str, file: Path | None) -> ExternalSession:
         """Opens the session of right of way for an external vehicle. Raises StoreError if another program has the
         file."""
-        from swarm.right_of_way.external_session import ExternalSession
+        from swarm.right_of_way.external_on_bus import ExternalSession
         from swarm.right_of_way.generations import GenerationFile
         from swarm.runtime.run_secret import state_folder
 

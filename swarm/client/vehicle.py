@@ -22,7 +22,7 @@ from swarm.wire.route_columns import RouteStatus
 from swarm.wire.topics import DIGEST, MARKS, OBSTACLE, PLACE_ROUTE, PUSHED_ROUTE, ROUTE, asker_of
 
 if TYPE_CHECKING:
-    from swarm.right_of_way.external_session import ExternalSession
+    from swarm.right_of_way.external_on_bus import ExternalSession
 
 
 class _Statement(NamedTuple):

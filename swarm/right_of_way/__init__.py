@@ -11,7 +11,7 @@ only its host ends it.
 The proof is in docs/design/right-of-way.md; docs/design/external-vehicles.md extends it to external vehicles.
 Modules of hosts: `host`, `holdings`, `host_entries`, `generations`. Modules of members: `shard_leader`,
 `shard_member`, and, where certificates prove names, `shard_witness`. An agent (`agent_core`) is both host and
-member. `agent_session` and `external_session` carry the messages. `promise_store` and the file of generations
+member. `agent_on_bus` and `external_on_bus` carry the messages. `promise_store` and the file of generations
 keep statements on disk. All other modules are pure: they receive the time and random numbers as arguments.
 
 Duties of a host (`Host`, which keeps what it holds in `Holdings`):

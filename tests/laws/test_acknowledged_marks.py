@@ -15,7 +15,7 @@ from support.swarm_model import LossyLinks, SwarmModel, SyncService
 
 from shared_map.keeper.mark_store import KeeperStore
 from shared_map.keeper.service import KeeperService
-from shared_map.replication.marks import base_seq
+from shared_map.replication.mark_sets import base_seq
 from swarm.config.scenario import MapConfig, Scenario
 from swarm.wire.messages.map_data import DIGEST_ROW, MarkKind, MarkSet
 

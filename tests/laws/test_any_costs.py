@@ -22,7 +22,7 @@ from support.planner_strategies import RULES, STRATEGIES, open_cell, random_clim
 from planner_service import RouteFinder
 from planner_service.kernels.cell_costs import CHEAPEST_S, DEAREST_S
 from planner_service.kernels.layout import NONE
-from planner_service.kernels.queue_levels import grow_by_levels, make_scratch
+from planner_service.kernels.multilevel_growth import grow_by_levels, make_scratch
 from planner_service.target_tree import TargetTree
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree

@@ -20,7 +20,7 @@ from planner_service.target_tree import TargetTree
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
 from planner_service.tree.partitioned_tree import PartitionedTree
-from planner_service.tree.route_bounds import LowerBounds, read_routes
+from planner_service.tree.routes_with_bounds import LowerBounds, read_routes
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec, Window, walk
 from swarm.wire.route_columns import Route, RouteStatus

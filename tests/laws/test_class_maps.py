@@ -9,7 +9,7 @@ from shared_map.array_files import Floats
 from shared_map.cost_map import CostMap
 from shared_map.learned_factors import factors_in, factors_of, keys_of
 from shared_map.pace_measurements import MOST, ONE, Measurement
-from shared_map.replication.marks import Statements, mark_set
+from shared_map.replication.mark_sets import Statements, mark_set
 from shared_map.replication.replica import MapReplica
 from shared_map.replication.tiles import beyond_tile
 from shared_map.terrain.pace_layers import inflate, inflation_halves

@@ -8,7 +8,7 @@ from support.kernel_oracle import WALLS, loaded
 from support.planner_strategies import RULES, inside, open_cell, random_climb, random_pace, random_window
 
 from planner_service.goal_tree_cache import GoalTrees
-from planner_service.kernels.queue_dial import NO_AIM
+from planner_service.kernels.dial_growth import NO_AIM
 from planner_service.target_tree import TargetTree
 from planner_service.tree.cost_to_go import CostToGoTree
 from planner_service.tree.partial_growth import PartialGrowth

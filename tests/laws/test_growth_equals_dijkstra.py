@@ -10,7 +10,7 @@ from support.kernel_oracle import loaded, random_grids
 from support.planner_strategies import RULES, random_pace
 from support.processes import words_of_python
 
-from planner_service.kernels import queue_dial, queue_levels
+from planner_service.kernels import dial_growth, multilevel_growth
 from planner_service.tree.cost_grid import CostGrid
 from swarm.config.scenario import PlannerConfig
 from swarm.grid import GridSpec
@@ -31,12 +31,12 @@ def test_buckets_of_one_level_and_of_many_give_the_same_costs_to_the_last_bit(ru
         ground = loaded(pace, **rules)
         root, width = ground.pad(target), 0.98 * ground.lowest_cell_cost
         narrow, leveled = np.empty(ground.size, np.float32), np.empty(ground.size, np.float32)
-        scratch = queue_dial.make_scratch(ground.size, ground.rule, 4096)
-        state, at_once = np.empty(5, np.int64), (np.array((root,)), queue_dial.WHOLE, queue_dial.NO_AIM)
-        assert queue_dial.grow_by_buckets(ground.padded, narrow, (width, 4096), scratch, state, *at_once) > 0
-        room = queue_levels.make_scratch(ground.size)
+        scratch = dial_growth.make_scratch(ground.size, ground.rule, 4096)
+        state, at_once = np.empty(5, np.int64), (np.array((root,)), dial_growth.WHOLE, dial_growth.NO_AIM)
+        assert dial_growth.grow_by_buckets(ground.padded, narrow, (width, 4096), scratch, state, *at_once) > 0
+        room = multilevel_growth.make_scratch(ground.size)
         for finest in (width, width / 1000):
-            queue_levels.grow_by_levels(ground.padded, None, leveled, root, finest, True, room)
+            multilevel_growth.grow_by_levels(ground.padded, None, leveled, root, finest, True, room)
             np.testing.assert_array_equal(leveled, narrow)
 
 

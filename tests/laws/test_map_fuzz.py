@@ -26,7 +26,7 @@ from support.message_fuzzer import mutated
 from support.swarm_model import SwarmModel
 
 from shared_map.keeper.mark_store import KeeperStore
-from shared_map.replication.marks import fault, packed, unpacked
+from shared_map.replication.mark_sets import fault, packed, unpacked
 from shared_map.replication.replica import MapReplica
 from swarm.bus.bus import meant_for
 from swarm.errors import ProtocolError

@@ -10,7 +10,7 @@ from support import map_strategies as drawn
 from shared_map.replication import merge as merge_module
 from shared_map.replication.author_limits import Capacity
 from shared_map.replication.digest import fingerprint
-from shared_map.replication.marks import mark_set, packed, statements, unpacked
+from shared_map.replication.mark_sets import mark_set, packed, statements, unpacked
 from shared_map.replication.replica import MapReplica
 from swarm.errors import ProtocolError
 from swarm.wire.codec import decode, encode

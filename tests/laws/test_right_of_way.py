@@ -26,7 +26,7 @@ from support.traffic_world import TICK_NS, Faults, Process, TrafficWorld, random
 from swarm.grid import GridSpec
 from swarm.right_of_way import host_entries
 from swarm.right_of_way.agent_core import OwnRecord, RightOfWay
-from swarm.right_of_way.agent_session import OwnTime
+from swarm.right_of_way.agent_on_bus import OwnTime
 from swarm.right_of_way.cell_orders import Orders
 from swarm.right_of_way.holdings import Holdings
 from swarm.right_of_way.shard_leader import Leader

@@ -19,7 +19,7 @@ from support.made_up_swarm import some_set
 from shared_map.keeper.mark_store import KeeperStore
 from shared_map.keeper.service import KeeperService
 from shared_map.pace_measurements import ONE, Measurement, columns_of
-from shared_map.replication.marks import Statements, mark_set
+from shared_map.replication.mark_sets import Statements, mark_set
 from shared_map.replication.tiles import beyond_region, beyond_tile
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.bus.bus import Event, Heard

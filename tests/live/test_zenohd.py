@@ -14,7 +14,7 @@ from support.zenohd import Zenohd, plugins
 
 from launch_scripts.deploy.certificates import issue
 from launch_scripts.ports import free_ports
-from shared_map.replication.marks import mark_set, statements
+from shared_map.replication.mark_sets import mark_set, statements
 from shared_map.replication.replica import MapReplica
 from shared_map.replication.replica_sync import MapSync
 from swarm.bus.zenoh_bus import ZenohBus, open_bus

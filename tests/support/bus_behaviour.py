@@ -10,7 +10,7 @@ import pytest
 from support.bus_world import Box, World, answering, asked, decoded, heard_by, marks, note, pose, waiting
 from support.makers import cost_reply, run_info
 
-from shared_map.replication.marks import packed
+from shared_map.replication.mark_sets import packed
 from swarm.bus.bus import Appeared, Asked, AskEnded, Disappeared, Event, Heard, LinkChanged, Replied, meant_for
 from swarm.peers import Peer
 from swarm.wire.access import Authenticator

@@ -94,7 +94,7 @@ def from_file(path: Path) -> Pace:
         case ".npy":
             pace = _read_npy(path)
         case ".map":
-            from shared_map.importers.plain_grids import read_map
+            from shared_map.importers.grids_without_gdal import read_map
 
             pace = read_map(path).numbers
         case _:

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 from support.makers import fleet_of, run_info, target_pose
 
-from shared_map.replication.marks import Statements, mark_set
+from shared_map.replication.mark_sets import Statements, mark_set
 from swarm.bus.bus import Asked
 from swarm.bus.zenoh_bus import ZenohBus, open_bus
 from swarm.config.scenario import NetworkConfig

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from hypothesis import strategies as st
 
-from shared_map.replication.marks import NO_STATEMENT, Statements, mark_set, sparse
+from shared_map.replication.mark_sets import NO_STATEMENT, Statements, mark_set, sparse
 from shared_map.replication.replica import MapReplica
 from shared_map.replication.tiles import tile_cells
 from swarm.bus.bus import Bus, Event, Heard

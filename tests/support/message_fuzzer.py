@@ -19,7 +19,7 @@ import msgspec
 import numpy as np
 
 from shared_map.pace_measurements import KEYS, MOST, MOST_CELLS, ONE, Measurement, columns_of
-from shared_map.replication.marks import packed
+from shared_map.replication.mark_sets import packed
 from shared_map.replication.tiles import beyond_tile, region_of
 from swarm.clock import NS_PER_S
 from swarm.config.scenario import agent_of

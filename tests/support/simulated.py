@@ -19,7 +19,7 @@ from swarm.clock import NS_PER_S
 from swarm.config.scenario import AddedAgent, Scenario, agent_of, plan_agents, traffic_grid
 from swarm.config.scenario_files import parse_scenario
 from swarm.peers import ranked_id
-from swarm.right_of_way.external_session import ExternalService
+from swarm.right_of_way.external_on_bus import ExternalService
 from swarm.right_of_way.generations import MemoryGenerations
 from swarm.runtime.order_book import OrderBook
 from swarm.runtime.stats import CAPTURES_BY

@@ -14,7 +14,7 @@ from swarm.config.scenario import agent_of
 from swarm.grid import GridSpec
 from swarm.peers import Peer
 from swarm.right_of_way.agent_core import Action, OwnRecord, RightOfWay
-from swarm.right_of_way.agent_session import OwnTime
+from swarm.right_of_way.agent_on_bus import OwnTime
 from swarm.right_of_way.holdings import CellRequest, SendState
 from swarm.right_of_way.host import AskKnown
 from swarm.right_of_way.shard_member import AskPromises, Refused, Save

@@ -21,8 +21,8 @@ from numpy.typing import NDArray
 from rasterio.enums import ColorInterp
 
 from shared_map.array_files import Bools, Bytes, Floats
+from shared_map.importers.gdal_rasters import opened, sampled
 from shared_map.importers.georeference import place_on
-from shared_map.importers.raster_files import opened, sampled
 from shared_map.importers.terrain_sources import Source
 from shared_map.terrain.pace_layers import TerrainClass
 from shared_map.terrain.row_bands import Progress, no_progress

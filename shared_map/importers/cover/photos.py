@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from rasterio.enums import ColorInterp
 
 from shared_map.array_files import Bools, Bytes, Floats
+from shared_map.importers.gdal_rasters import middle_of, opened, sampled
 from shared_map.importers.georeference import place_on
-from shared_map.importers.raster_files import middle_of, opened, sampled
 from shared_map.importers.water_and_voids import CODES
 from shared_map.terrain.row_bands import Progress, no_progress
 from swarm.errors import TerrainError

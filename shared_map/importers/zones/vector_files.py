@@ -28,8 +28,8 @@ from msgspec import Meta, Struct
 from numpy.typing import NDArray
 from pyogrio.raw import read
 
+from shared_map.importers.gdal_rasters import DRAWINGS, beginning, faults_of, is_raster, number_of, other_format
 from shared_map.importers.georeference import system_named
-from shared_map.importers.raster_files import DRAWINGS, beginning, faults_of, is_raster, number_of, other_format
 from swarm.config.explain import nearest
 from swarm.config.input_files import FileKind, check_bytes, read_bytes, size
 from swarm.errors import TerrainError

@@ -10,8 +10,8 @@ from typing import NamedTuple
 import numpy as np
 
 from shared_map.array_files import Bools, Floats
+from shared_map.importers.gdal_rasters import is_raster, opened
 from shared_map.importers.georeference import crs_name, place_on
-from shared_map.importers.raster_files import is_raster, opened
 from swarm.config.ground import ZoneConfig
 from swarm.errors import TerrainError
 from swarm.grid import GridSpec, Window

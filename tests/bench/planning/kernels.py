@@ -14,7 +14,7 @@ from support.kernel_oracle import loaded
 
 from bench.harness import FieldOption, Seed, benchmark, cpu_ms, track
 from planner_service.tree.cost_to_go import CostToGoTree
-from planner_service.tree.route_bounds import LowerBounds, read_routes
+from planner_service.tree.routes_with_bounds import LowerBounds, read_routes
 from swarm.grid import Window
 
 CHANGES: dict[str, float] = {"x 0.7": 0.7, "x 1.5": 1.5, "x 3": 3.0, "lethal": np.inf}

@@ -17,7 +17,7 @@ from support.made_up_swarm import GRID, some_set
 
 from bench.harness import cpu_ms
 from shared_map.cost_map import CostMap
-from shared_map.replication.marks import packed
+from shared_map.replication.mark_sets import packed
 from shared_map.replication.replica import MapReplica
 from shared_map.replication.replica_sync import MapSync
 from shared_map.terrain.terrain import terrain_of_pace

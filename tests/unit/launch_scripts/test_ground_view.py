@@ -51,7 +51,7 @@ from launch_scripts.report.run_page_and_map import QUICKER, SLOWER, learned_pixe
 from shared_map.cost_map import CostMap
 from shared_map.learned_factors import LearnedGauges
 from shared_map.pace_measurements import ONE, Measurement
-from shared_map.replication.marks import zone_author
+from shared_map.replication.mark_sets import zone_author
 from shared_map.replication.replica import MapReplica
 from shared_map.terrain.terrain import Terrain, terrain_of_pace
 from shared_map.terrain.zones import paint_zones
@@ -144,11 +144,20 @@ def test_a_border_lies_between_inside_and_outside_and_nowhere_else(cells: list[t
     assert inside[int(-place[1] // 10), int(place[0] // 10)], "a name stands inside its zone"
 
 
+RING = [[100, -100], [200, -100], [200, -200], [100, -200], [100, -100]]
+
+
+def lake(folder: Path) -> Path:
+    """A file with one square of water, in metres of the map."""
+    area = {"type": "Polygon", "coordinates": [RING]}
+    (folder / "lake.geojson").write_text(
+        json.dumps({"type": "Feature", "properties": {"natural": "water"}, "geometry": area})
+    )
+    return folder / "lake.geojson"
+
+
 def test_zones_of_a_scenario_are_drawn_by_what_they_do(tmp_path: Path) -> None:
-    file = tmp_path / "lake.geojson"
-    ring = [[100, -100], [200, -100], [200, -200], [100, -200], [100, -100]]
-    feature = {"type": "Feature", "properties": {}, "geometry": {"type": "Polygon", "coordinates": [ring]}}
-    file.write_text(json.dumps({"type": "FeatureCollection", "features": [feature]}))
+    file = lake(tmp_path)
     square = "polygon_m = [[20, 20], [60, 20], [60, 60], [20, 60]]"
     scenario = zoned(
         f'[[cost.zones]]\nkind = "forbidden"\nname = "mines"\n{square}\n'
@@ -167,16 +176,8 @@ def test_zones_of_a_scenario_are_drawn_by_what_they_do(tmp_path: Path) -> None:
 @pytest.mark.parametrize("kind", [kind for kind in get_args(get_type_hints(ZoneConfig)["kind"]) if kind != "road"])
 @pytest.mark.parametrize("drawn", ["corners", "file"])
 def test_a_zone_is_drawn_where_the_cost_map_has_it(kind: str, drawn: str, tmp_path: Path) -> None:
-    file = tmp_path / "zone.geojson"
-    ring = [[100, -100], [200, -100], [200, -200], [100, -200], [100, -100]]
-    feature = {
-        "type": "Feature",
-        "properties": {"natural": "water"},
-        "geometry": {"type": "Polygon", "coordinates": [ring]},
-    }
-    file.write_text(json.dumps({"type": "FeatureCollection", "features": [feature]}))
-    corners = f"polygon_m = {[[east, -north] for east, north in ring[:4]]}"
-    where = corners if drawn == "corners" else f'file = "{file}"\ncrs = "local"'
+    corners = f"polygon_m = {[[east, -north] for east, north in RING[:4]]}"
+    where = corners if drawn == "corners" else f'file = "{lake(tmp_path)}"\ncrs = "local"'
     value = {"factor": "factor = 3.0\n", "pace": "pace_s_per_m = 2.0\n"}.get(kind, "")
     scenario = zoned(f'[[cost.zones]]\nkind = "{kind}"\n{value}{where}\n')
     pace = np.array(flat().pace_s_per_m)

@@ -42,7 +42,7 @@ from launch_scripts.simulation.study import (
 )
 from launch_scripts.simulation.study_sweep import ResultStore, Sweep
 from launch_scripts.simulation.trials import Result, Trial, run_trial
-from shared_map.replication.marks import MAX_AHEAD_NS
+from shared_map.replication.mark_sets import MAX_AHEAD_NS
 from swarm.clock import NS_PER_S
 from swarm.config.scenario_files import load_scenario, parse_scenario
 from swarm.errors import ConfigError, StoreError

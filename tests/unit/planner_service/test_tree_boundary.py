@@ -7,7 +7,7 @@ import pytest
 
 from planner_service.tree.cost_grid import CostGrid
 from planner_service.tree.cost_to_go import CostToGoTree
-from planner_service.tree.route_bounds import LowerBounds
+from planner_service.tree.routes_with_bounds import LowerBounds
 from planner_service.tree.strides import find_strides
 from swarm.config.scenario import PlannerConfig
 from swarm.errors import OutsideGridError

@@ -13,7 +13,7 @@ from support.swarm_model import SwarmModel
 from shared_map.keeper.compaction import CompactionPlan, compact
 from shared_map.keeper.mark_store import KeeperStore
 from shared_map.replication.held_sets import REMEMBERED_NS, Tombstones
-from shared_map.replication.marks import base_seq, is_tombstone, mark_set, next_seq, statements
+from shared_map.replication.mark_sets import base_seq, is_tombstone, mark_set, next_seq, statements
 from shared_map.replication.replica import MapReplica
 from shared_map.terrain.terrain import terrain_of_pace
 from swarm.clock import NS_PER_S

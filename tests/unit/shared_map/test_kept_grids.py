@@ -141,7 +141,7 @@ def test_a_grid_as_text_is_read_in_all_its_versions(tmp_path: Path, text: str) -
 
 
 def test_a_line_of_tabs_longer_than_a_piece_is_read_once(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("shared_map.importers.raster_files._TEXT_PIECE_BYTES", 16)
+    monkeypatch.setattr("shared_map.importers.gdal_rasters._TEXT_PIECE_BYTES", 16)
     (tmp_path / "a.asc").write_text(HEAD + "\t".join(["1.25"] * 5 + ["123456789.5"]))
     assert load(tmp_path / "a.asc").elevation_m[0].tolist() == [1.25] * 3
 

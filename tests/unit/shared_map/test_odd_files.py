@@ -18,7 +18,7 @@ from rasterio.transform import Affine, from_origin
 from support.height_models import SIDE, hills, is_water, load, written
 
 from shared_map.array_files import Floats
-from shared_map.importers.raster_files import _HEADER_PAIR
+from shared_map.importers.gdal_rasters import _HEADER_PAIR
 from shared_map.importers.water_and_voids import level_ground
 from shared_map.terrain.pace_layers import TerrainClass
 from swarm.errors import TerrainError

@@ -12,7 +12,7 @@ from rasterio.transform import from_origin
 from support.effort import few
 from support.height_models import load, written
 
-from shared_map.importers.plain_grids import read_text_grid
+from shared_map.importers.grids_without_gdal import read_text_grid
 from shared_map.terrain.terrain import build_terrain
 from swarm.config.ground import CostConfig, TerrainConfig
 from swarm.config.scenario import Scenario
@@ -288,7 +288,7 @@ def test_what_is_no_text_or_has_no_lines_is_refused(tmp_path: Path) -> None:
 
 
 def test_points_are_read_piece_by_piece(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr("shared_map.importers.plain_grids._LINES", 20)
+    monkeypatch.setattr("shared_map.importers.grids_without_gdal._LINES", 20)
     plain = read_text_grid(wrote(tmp_path / "a.csv", text_of(POINTS, ",", "x,y,z")), "a")
     np.testing.assert_array_equal(plain.numbers, GROUND)
     with pytest.raises(TerrainError, match="line 110: could not convert string 'what'"):

@@ -7,7 +7,7 @@ from support.swarm_model import LossyLinks, SwarmModel, SyncService, hold_the_sa
 
 from shared_map.keeper.mark_store import KeeperStore
 from shared_map.replication import replica_sync
-from shared_map.replication.marks import packed
+from shared_map.replication.mark_sets import packed
 from shared_map.replication.replica import MapReplica
 from shared_map.replication.replica_sync import MapSync
 from swarm.bus.bus import Asked, AskEnded, Event, Replied

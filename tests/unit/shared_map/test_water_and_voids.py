@@ -15,9 +15,9 @@ from support.effort import few, paired
 from support.height_models import SIDE, hills, is_water, load, written
 from support.water_models import MODELS, UNKNOWABLE, WaterModel, moved
 
-from shared_map.importers.plain_grids import read_npz
-from shared_map.importers.survey_cells import surveyed
+from shared_map.importers.grids_without_gdal import read_npz
 from shared_map.importers.terrain_sources import _jacksboro_path
+from shared_map.importers.undo_resampling import surveyed
 from shared_map.importers.water_and_voids import labelled, level_ground, level_patches, undeclared_voids
 
 # --- level ground -------------------------------------------------------------------------------------------

@@ -9,7 +9,7 @@ from swarm.bus.bus import Replied
 from swarm.config.scenario import Scenario
 from swarm.grid import GridSpec
 from swarm.right_of_way.agent_core import Action, OwnRecord, RightOfWay
-from swarm.right_of_way.agent_session import RightOfWaySync
+from swarm.right_of_way.agent_on_bus import RightOfWaySync
 from swarm.right_of_way.holdings import SendState
 from swarm.right_of_way.host import AskKnown
 from swarm.right_of_way.promise_store import PromiseStore

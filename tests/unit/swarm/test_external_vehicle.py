@@ -8,9 +8,9 @@ import pytest
 
 from swarm.errors import BusError, ConfigError, StoreError
 from swarm.grid import GridSpec
-from swarm.right_of_way import external_session
+from swarm.right_of_way import external_on_bus
 from swarm.right_of_way import shard_leader as leaders
-from swarm.right_of_way.external_session import ExternalService, ExternalSession
+from swarm.right_of_way.external_on_bus import ExternalService, ExternalSession
 from swarm.right_of_way.external_vehicle import ExternalVehicle
 from swarm.right_of_way.generations import MemoryGenerations
 from swarm.right_of_way.shard_leader import Leader
@@ -120,7 +120,7 @@ def test_a_name_that_cannot_be_a_part_of_a_key_is_refused() -> None:
 
 
 def test_who_drives_on_before_it_is_let_in_asks_for_where_it_stands(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(external_session, "_ENTER_S", 0.01)
+    monkeypatch.setattr(external_on_bus, "_ENTER_S", 0.01)
     bus, file = MagicMock(proves_names=False), MagicMock(generations=[])
     with ExternalSession("rover", GRID, bus, file) as session:
         for cell in (70, 71):

@@ -15,7 +15,7 @@ import swarm.right_of_way.shards
 from swarm.errors import ConfigError
 from swarm.grid import MOST_SHARDS, REGION_CELLS, GridSpec
 from swarm.right_of_way.agent_core import Action, OwnRecord, RightOfWay
-from swarm.right_of_way.external_session import ExternalService
+from swarm.right_of_way.external_on_bus import ExternalService
 from swarm.right_of_way.generations import MemoryGenerations
 from swarm.right_of_way.shards import Shards
 from swarm.wire.messages.traffic import Known, KnownRequest, Stored, Table

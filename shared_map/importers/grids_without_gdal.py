@@ -24,8 +24,8 @@ from rasterio import CRS
 from rasterio.transform import from_origin
 
 from shared_map.array_files import Floats
+from shared_map.importers.gdal_rasters import LONGEST_REASON, Numbers, ShortReads, faults_of
 from shared_map.importers.georeference import METRES, check_size
-from shared_map.importers.raster_files import LONGEST_REASON, Numbers, ShortReads, faults_of
 from swarm.config.explain import explain
 from swarm.config.input_files import FileKind, check_bytes, read_lines, read_text, size
 from swarm.errors import TerrainError

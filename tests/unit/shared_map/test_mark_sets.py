@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from support.map_strategies import GRID, Composite, mark_sets, merge_one, replica_of, retract, set_of
 
 from shared_map.replication import merge as merge_module
-from shared_map.replication.marks import (
+from shared_map.replication.mark_sets import (
     MAX_AHEAD_NS,
     NO_STATEMENT,
     HybridClock,

@@ -56,7 +56,7 @@ NOTES = "NOTES"
 """Tag of numbers which we have read ourselves: what people should know of them, a line each."""
 PLAIN = {".npz": "read_npz", ".csv": "read_text_grid", ".xyz": "read_text_grid"}
 """Endings of files whose numbers GDAL does not read, or not as they are (docs/design/terrain-import.md) -> their
-reader in `plain_grids`, which imports this module."""
+reader in `grids_without_gdal`, which imports this module."""
 LONGEST_REASON = 200
 """Characters of what a library says that are passed on."""
 READ_ROWS = 512
@@ -177,9 +177,9 @@ def _georeferenced(path: Path, what: str, files: contextlib.ExitStack) -> Any:
 
     what = f"{what} {path}"
     if is_named(path, PLAIN):
-        from shared_map.importers import plain_grids
+        from shared_map.importers import grids_without_gdal
 
-        return in_memory(getattr(plain_grids, PLAIN[path.suffix.lower()])(path, what), files)
+        return in_memory(getattr(grids_without_gdal, PLAIN[path.suffix.lower()])(path, what), files)
     name, driver, length = _kind_of(path, what)
     dataset = files.enter_context(rasterio.open(name, driver=driver))
     _check_size(dataset, what)

@@ -3,7 +3,7 @@ levels (E. V. Denardo, B. L. Fox, "Shortest-route methods: 1. Reaching, pruning,
 27(1), 1979, 161-186).
 
 Where a step costs by what it climbs, neighbours of a cell are offered different keys, so that a cell's first offer
-is not its least, as it is in `queue_dial`. But where no cell of a bucket offers anything that lies in it, all of
+is not its least, as it is in `dial_growth`. But where no cell of a bucket offers anything that lies in it, all of
 them are final. So a cell waits under its own cost, once for each time that it fell, and is served once. Parents
 follow from the costs.
 
