@@ -10,7 +10,7 @@
 | `.tif`     | GDAL's GeoTIFF    | pixels of the map (`write_raster`)                                          |
 
 Names of fields end in their unit: `_m`, `_s`, `_s_per_m`, `_m2`. A layer with costs says how they count (`COSTS`)
-in the description of the layer, where the format has one. All formats but CSV and GeoTIFF need the extra "vectors".
+in the description of the layer or file, CSV in a column. All formats but CSV and GeoTIFF need the extra "vectors".
 """
 
 from __future__ import annotations
@@ -153,17 +153,21 @@ def _write_layer(path: Path, layer: Layer, frame: MapFrame, driver: str, append:
     from pyogrio.errors import DataLayerError, DataSourceError
 
     placed, crs = frame.grid.crs != "local", None
-    kinds, options = dict[str, FieldKind](), {"DESCRIPTION": layer.described() or layer.name}
+    description = layer.described() or layer.name
+    kinds, options, whole = dict[str, FieldKind](), {"DESCRIPTION": description}, dict[str, str]()
     match driver:
         case "GeoJSON":
             kinds = {"layer": "text", **({"times": "json"} if _is_timed(layer) else {})}
             options["COORDINATE_PRECISION"] = "8" if placed else "3"
         case "LIBKML":
-            kinds, options, crs = {"tessellate": "flag", "altitudeMode": "text"}, {}, "EPSG:4326"
+            kinds, crs = {"tessellate": "flag", "altitudeMode": "text"}, "EPSG:4326"
         case "GPX":
             layer, options, crs = _gpx_points(layer), {}, "EPSG:4326"
-        case "GPKG" if placed:
-            crs = named_system(frame)
+            whole = {"METADATA_DESCRIPTION": description}
+        case "GPKG":
+            crs = named_system(frame) if placed else None
+            # QGIS and ArcGIS of before 2020 open no newer one.
+            whole = {} if append else {"VERSION": "1.2"}
     kinds |= layer.fields
     constant = {"layer": layer.name, "tessellate": 1, "altitudeMode": "clampToGround"}
     values: dict[str, list[Any]] = {
@@ -196,8 +200,7 @@ def _write_layer(path: Path, layer: Layer, frame: MapFrame, driver: str, append:
                 crs=crs,
                 append=append,
                 layer_options=options,
-                # QGIS and ArcGIS of before 2020 open no newer one.
-                dataset_options={"VERSION": "1.2"} if driver == "GPKG" and not append else {},
+                dataset_options=whole,
                 gdal_tz_offsets={  # 100 is UTC
                     name: np.full(len(layer.features), 100) for name, kind in kinds.items() if kind == "time"
                 },
@@ -268,7 +271,7 @@ def _places_of(layer: Layer) -> Layer:
 
 def _write_csv(path: Path, layer: Layer, frame: MapFrame) -> None:
     """A row per point, with metres of the map, and degrees where it has a place. An area, and a line without times,
-    is one row, with its shape as WKT, longitude first."""
+    is one row, with its shape as WKT, longitude first. The last column of a layer with costs states their rule."""
     layer = _places_of(layer) if _is_timed(layer) else layer
     placed = frame.grid.crs != "local"
     if layer.shape != "Point":
@@ -284,15 +287,12 @@ def _write_csv(path: Path, layer: Layer, frame: MapFrame) -> None:
         where = [[*xy, *lat_lon] for xy, lat_lon in zip(points.round(3).tolist(), degrees.tolist(), strict=True)]
     with path.open("w", encoding="utf-8", newline="") as file:
         writer = csv.writer(file, lineterminator="\n")
-        writer.writerow([*layer.fields, *names])
+        rule = {"cost_rule": "pace of the cell entered"} if layer.about == COSTS else {}
+        writer.writerow([*layer.fields, *names, *rule])
         for feature, place in zip(layer.features, where, strict=True):
-            values = [feature.values[name] for name in layer.fields]
-            writer.writerow(
-                [
-                    *(json.dumps(each) if isinstance(each, list | dict) else iso_time(each) for each in values),
-                    *place,
-                ]
-            )
+            values = (feature.values[name] for name in layer.fields)
+            texts = (json.dumps(each) if isinstance(each, list | dict) else iso_time(each) for each in values)
+            writer.writerow([*texts, *place, *rule.values()])
 
 
 # --- values and shapes --------------------------------------------------------------------------------------------

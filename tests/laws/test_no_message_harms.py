@@ -15,6 +15,7 @@ from support.bus_world import Box
 from support.effort import few, paired
 from support.liar import Liar, asked, published
 from support.message_fuzzer import NAMES, ROLES, MessageFuzzer
+from support.simulated import DRONE, WALKER, WINDY
 from support.swarm_model import SwarmModel
 from support.wire_strategies import types_of_the_wire
 
@@ -72,11 +73,6 @@ class_factor = { grass = 3.0 }
 max_slope_deg = 22.0
 [map]
 learning = true
-[wind]
-speed_m_per_s = 7.0
-from_deg = 250.0
-[planner]
-routes = "pulled"
 [[targets]]
 speed_m_per_s = 2
 [[targets]]
@@ -95,18 +91,6 @@ vehicles = 2
 name = "drones"
 class = "drone"
 vehicles = 2
-[[classes]]
-name = "walker"
-max_speed_m_per_s = 2.0
-sense_range_m = 40.0
-accel_m_per_s2 = 1.0
-turn_rate_deg_per_s = 120.0
-cost = { slope_rule = "tobler", flat_speed_m_per_s = 1.8, road_speed_m_per_s = 2.0, max_slope_deg = 38.0 }
-[[classes]]
-name = "drone"
-[classes.air]
-speed_m_per_s = 12.0
-clearance_m = 40.0
 """
 """A run with all features: classes that drive and that fly, in a wind, pulled routes, a hidden target, a group that
 shares its targets out, and learned ground."""
@@ -122,7 +106,7 @@ targets = 1
 [monitor]
 live = false
 """
-TEXTS = {"plain": PLAIN + BOTH, "whole": WHOLE + BOTH}
+TEXTS = {"plain": PLAIN + BOTH, "whole": WHOLE + WALKER + DRONE + WINDY + BOTH}
 NAMED = ("t", "h", "h.r1", "walkers", "drones", *(f"a{n}-0{m}" for n in range(4) for m in range(2)))
 AUTHORS = ("all.a0.1", "all.a1.1", "all.a1.2", "walkers.a2.1", "drones.a3.1")
 PACE = np.ones((40, 72), np.float32) / 5

@@ -6,7 +6,7 @@ import statistics
 
 import numpy as np
 import pytest
-from support.simulated import OrderedSimulation, agents, captures_by_class, cells, made, vehicles
+from support.simulated import DRONE, WINDY, OrderedSimulation, agents, captures_by_class, cells, made, vehicles
 
 from launch_scripts.simulation.laws import LawBook
 from launch_scripts.simulation.simulate import Node
@@ -32,24 +32,14 @@ name = "drones"
 targets = ["t2", "t3"]
 class = "drone"
 vehicles = 12
-[[classes]]
-name = "drone"
-[classes.air]
-speed_m_per_s = 12.0
-clearance_m = 40.0
-no_fly = [{ kind = "forbidden", polygon_m = [[200, 200], [300, 200], [300, 300], [200, 300]] }]
 [vehicles]
 per_agent = 4
 sense_range_m = 60.0
 capture_range_m = 30.0
 """
-WINDY = """
-[wind]
-speed_m_per_s = 7.0
-from_deg = 250.0
-[planner]
-routes = "pulled"
-"""
+_TEXT += (
+    f"{DRONE}no_fly = [{{ kind = 'forbidden', polygon_m = [[200, 200], [300, 200], [300, 300], [200, 300]] }}]\n"
+)
 
 
 @pytest.mark.parametrize("added", ["", WINDY], ids=["still", "windy"])

@@ -7,7 +7,7 @@ import numpy as np
 from hypothesis import given, reject, settings
 from hypothesis import strategies as st
 from support.effort import few
-from support.simulated import OrderedSimulation, agents, captures_by_class, cells, made, vehicles
+from support.simulated import WALKER, OrderedSimulation, agents, captures_by_class, cells, made, vehicles
 
 from launch_scripts.simulation.faults import random_plan
 from launch_scripts.simulation.laws import LawBook
@@ -39,18 +39,12 @@ vehicles = 8
 name = "walkers"
 class = "walker"
 vehicles = 8
-[[classes]]
-name = "walker"
-max_speed_m_per_s = 2.0
-sense_range_m = 40.0
-accel_m_per_s2 = 1.0
-turn_rate_deg_per_s = 120.0
-cost = { slope_rule = "tobler", flat_speed_m_per_s = 1.8, road_speed_m_per_s = 2.0, max_slope_deg = 38.0 }
 [vehicles]
 per_agent = 4
 sense_range_m = 60.0
 capture_range_m = 30.0
 """
+_TEXT += WALKER
 
 
 def driven_by(simulation: OrderedSimulation) -> dict[str, set[int]]:

@@ -46,6 +46,16 @@ def scenario(
     return SCENARIO.format(vehicles=vehicles, cells=given, per_agent=per_agent, capture=capture)
 
 
+FORK = [
+    "###################",
+    "#.................#",
+    "#.####.##########.#",
+    "#.####.##########.#",
+    "#.................#",
+    "###################",
+]
+"""Two ways, which part in column 6."""
+CLOSED_FORK = [FORK[0], "#............#....#", *FORK[2:]]
 OPEN = ["." * 20] * 20
 """A picture for `pace_of`: level ground without an obstacle."""
 

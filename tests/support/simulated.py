@@ -28,6 +28,30 @@ from swarm.wire.topics import GIVE_ORDER, SEND_VEHICLE, ZONES
 from vehicle_agent.driving.driven_vehicle import Vehicle
 from vehicle_agent.service import AgentService
 
+WALKER = """
+[[classes]]
+name = "walker"
+max_speed_m_per_s = 2.0
+sense_range_m = 40.0
+accel_m_per_s2 = 1.0
+turn_rate_deg_per_s = 120.0
+cost = { slope_rule = "tobler", flat_speed_m_per_s = 1.8, road_speed_m_per_s = 2.0, max_slope_deg = 38.0 }
+"""
+DRONE = """
+[[classes]]
+name = "drone"
+[classes.air]
+speed_m_per_s = 12.0
+clearance_m = 40.0
+"""
+WINDY = """
+[wind]
+speed_m_per_s = 7.0
+from_deg = 250.0
+[planner]
+routes = "pulled"
+"""
+
 
 def simulate(
     scenario: Scenario,

@@ -150,10 +150,9 @@ RING = [[100, -100], [200, -100], [200, -200], [100, -200], [100, -100]]
 def lake(folder: Path) -> Path:
     """A file with one square of water, in metres of the map."""
     area = {"type": "Polygon", "coordinates": [RING]}
-    (folder / "lake.geojson").write_text(
-        json.dumps({"type": "Feature", "properties": {"natural": "water"}, "geometry": area})
-    )
-    return folder / "lake.geojson"
+    feature = {"type": "Feature", "properties": {"natural": "water"}, "geometry": area}
+    (file := folder / "lake.geojson").write_text(json.dumps(feature))
+    return file
 
 
 def test_zones_of_a_scenario_are_drawn_by_what_they_do(tmp_path: Path) -> None:
@@ -178,13 +177,13 @@ def test_zones_of_a_scenario_are_drawn_by_what_they_do(tmp_path: Path) -> None:
 def test_a_zone_is_drawn_where_the_cost_map_has_it(kind: str, drawn: str, tmp_path: Path) -> None:
     corners = f"polygon_m = {[[east, -north] for east, north in RING[:4]]}"
     where = corners if drawn == "corners" else f'file = "{lake(tmp_path)}"\ncrs = "local"'
-    value = {"factor": "factor = 3.0\n", "pace": "pace_s_per_m = 2.0\n"}.get(kind, "")
-    scenario = zoned(f'[[cost.zones]]\nkind = "{kind}"\n{value}{where}\n')
-    pace = np.array(flat().pace_s_per_m)
+    value = {"factor": "factor = 3.0", "pace": "pace_s_per_m = 2.0"}.get(kind, "")
+    scenario = zoned(f'[[cost.zones]]\nkind = "{kind}"\n{value}\n{where}\n')
+    pace = flat().pace_s_per_m.copy()
     paint_zones(pace, scenario.cost.zones, flat().grid, scenario.cost)
-    (area,) = scenario_areas(scenario, flat().grid)
+    (area,) = areas = scenario_areas(scenario, flat().grid)
     np.testing.assert_array_equal(area.cells, np.flatnonzero(pace != flat().pace_s_per_m))
-    np.testing.assert_array_equal(closed_cells([area]), np.flatnonzero(np.isinf(pace)))
+    np.testing.assert_array_equal(closed_cells(areas), np.flatnonzero(np.isinf(pace)))
 
 
 def test_zones_of_operators_are_those_that_stand() -> None:

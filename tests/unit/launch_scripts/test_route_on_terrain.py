@@ -88,7 +88,10 @@ def test_a_route_goes_around_the_ridge_and_every_format_holds_it(hill: Path, tmp
     assert len(pyogrio.raw.read(tmp_path / "way.gpkg", layer="route_cells")[2]) == many
     with (tmp_path / "way.csv").open() as file:
         rows = list(csv.DictReader(file))
-    assert (len(rows), rows[0]["row"], rows[0]["col"]) == (many, "10", "5")
+    columns = [rows[0][name] for name in ("row", "col", "cost_rule")]
+    assert (len(rows), *columns) == (many, "10", "5", "pace of the cell entered")
+    for ending in ("geojson", "gpx", "kml"):
+        assert "(s/m) of the cell that it enters" in (tmp_path / f"way.{ending}").read_text()
 
 
 def test_a_route_is_written_as_a_mission_with_times_and_for_old_readers(hill: Path, tmp_path: Path) -> None:

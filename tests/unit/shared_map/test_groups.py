@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from support.agent_world import AgentWorld, pace_of
+from support.agent_world import CLOSED_FORK, FORK, AgentWorld, pace_of
 
 from shared_map.replication.interest import MarkFilter, readable_for_target
 from shared_map.replication.replica import MapReplica
@@ -14,7 +14,6 @@ from swarm.grid import GridSpec
 from swarm.runtime.order_book import OrderBook
 from swarm.wire.messages.map_data import MarkKind, MarkSet
 from swarm.wire.messages.orders import Order
-from swarm.wire.topics import MARKS
 
 GRID = GridSpec(96, 96, 10.0)
 NAMES = ("red", "blue", "grey")
@@ -107,15 +106,6 @@ def test_a_set_that_claims_another_group_than_its_author_has_is_refused() -> Non
 
 # --- a swarm ------------------------------------------------------------------------------------------------
 
-PRIOR = [
-    "###################",
-    "#.................#",
-    "#.####.##########.#",
-    "#.####.##########.#",
-    "#.................#",
-    "###################",
-]
-TRUTH = [PRIOR[0], "#............#....#", *PRIOR[2:]]
 TWO_GROUPS = """
 targets = [{{ name = "t", walk = "still" }}]
 groups = [
@@ -128,9 +118,9 @@ vehicles = {{ per_agent = 1, sense_range_m = 30.0, capture_range_m = 10.0 }}
 
 @pytest.mark.parametrize("writes", [["*"], []])
 def test_a_mark_reaches_another_group_only_if_its_own_lets_it(writes: list[str]) -> None:
-    world = AgentWorld(TWO_GROUPS.format(writes=writes), pace_of(PRIOR), pace_of(TRUTH)).begin(t=(1, 17))
+    world = AgentWorld(TWO_GROUPS.format(writes=writes), pace_of(FORK), pace_of(CLOSED_FORK)).begin(t=(1, 17))
     world.run(5.0)
-    closed = np.isinf(pace_of(TRUTH)) & ~np.isinf(pace_of(PRIOR))
+    closed = np.isinf(pace_of(CLOSED_FORK)) & ~np.isinf(pace_of(FORK))
     red, blue = (service._maps.common.ground_s_per_m[closed] for service in world.agents.values())
     assert np.isinf(red).all()
     assert np.isinf(blue).all() == bool(writes)
@@ -139,4 +129,3 @@ def test_a_mark_reaches_another_group_only_if_its_own_lets_it(writes: list[str])
     world.run(10.0)  # digests go on, and bring no more refusals than puts
     assert world.agents["a1"].counters.counts["sets_foreign"] <= refused + 1
     world.assert_lawful()
-    assert MARKS.key.endswith("/{author}")

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from support.agent_world import OPEN, AgentWorld, pace_of, scenario
+from support.agent_world import CLOSED_FORK, FORK, OPEN, AgentWorld, pace_of, scenario
 
 from swarm.bus.bus import LinkChanged
 from swarm.clock import NS_PER_S
@@ -82,26 +82,15 @@ def test_a_vehicle_that_drives_between_two_ticks_avoids_an_obstacle_that_has_com
 
 
 def test_marks_of_one_agent_spare_another_the_detour() -> None:
-    prior = [
-        "###################",
-        "#.................#",
-        "#.####.##########.#",
-        "#.####.##########.#",
-        "#.................#",
-        "###################",
-    ]
-    truth = list(prior)
-    truth[1] = "#............#....#"
-    world = AgentWorld(scenario(2, [(1, 10), (1, 2)], per_agent=1), pace_of(prior), pace_of(truth)).begin(t=(1, 17))
+    world = AgentWorld(scenario(2, [(1, 10), (1, 2)], 1), pace_of(FORK), pace_of(CLOSED_FORK)).begin(t=(1, 17))
     world.arrive(90)
     # The second turned off at the branch: it never came within its sensor's three cells of the closure.
     assert [service.counters.counts["marks"] for service in world.agents.values()] == [1, 0]
 
 
 def test_slow_ground_is_marked_and_driven_at_its_own_pace() -> None:
-    prior = ["." * 14]
-    truth = [".....~~~~....."]
-    world = AgentWorld(scenario(1, [(0, 0)]), pace_of(prior), pace_of(truth)).begin(t=(0, 13))
+    truth = pace_of([".....~~~~....."])
+    world = AgentWorld(scenario(1, [(0, 0)]), pace_of(["." * 14]), truth).begin(t=(0, 13))
     took_s = world.arrive(60)
     # 12 cells, four of them at three times the pace.
     assert 19.4 <= took_s <= 22.0
