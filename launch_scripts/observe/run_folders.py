@@ -283,11 +283,12 @@ def find_run(name: str, runs: Path) -> Path:
 
 def find_parts(name: str, runs: Path) -> list[Path]:
     """The folders of a run on this machine, one of each of its launchers that has its own, as where two machines
-    are rehearsed on one; only those where a launcher runs, if there are such. A path is that one folder. Raises
-    ConfigError as `find_run`."""
-    parts = [run for run in registered() if run.name == name] if runs == RUNS else []
-    active = [run.folder for run in parts if run.launchers]
-    return active or [run.folder for run in parts] or [find_run(name, runs)]
+    are rehearsed on one; only those where a launcher runs, if there are such. A path is that one folder; so is the
+    name of runs with unlike scenarios or seeds. Raises ConfigError as `find_run`."""
+    known = [run for run in registered() if run.name == name] if runs == RUNS else []
+    parts = [run.folder for run in known if run.launchers] or [run.folder for run in known]
+    kinds = {(facts.get("scenario"), facts.get("seed")) for facts in map(run_facts, parts)}
+    return parts if len(kinds) == 1 else [find_run(name, runs)]
 
 
 def lacks(folder: Path, file: str) -> ConfigError:
@@ -341,12 +342,10 @@ def _now() -> str:
 
 def processor() -> str:
     """Name of the processor, as far as the system says it."""
-    try:
+    with suppress(OSError):
         for line in Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines():
             if line.startswith("model name"):
                 return line.partition(":")[2].strip()
-    except OSError:
-        pass
     return platform.processor() or platform.machine()
 
 

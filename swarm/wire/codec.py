@@ -204,7 +204,7 @@ def field_fault(error: Exception, fields: Mapping[Any, Any], message_type: type[
         for name, index in _STEPS.findall(path):
             found = found[int(index)] if index else found[name]
     except (LookupError, TypeError):  # a place in a mapping, which msgspec writes as [...]
-        return f"{path}: {expected}"[:300]
+        return f"{path}: expected {expected}"[:300]
     if text.startswith("Invalid enum value"):
         hint = _hints_of(message_type).get(path)
         words = [word for each in (hint, *typing.get_args(hint)) for word in typing.get_args(each)]

@@ -144,18 +144,19 @@ def test_a_run_in_two_folders_is_one_run_by_its_name(
 ) -> None:
     for half, port in zip(("a", "b"), listens, strict=True):
         make_run(tmp_path / half, "halves", port)
-        (tmp_path / half / "halves" / f"agent-{half}0.log").write_text(
-            f"2026-01-01 00:00:0{port % 10} from {half}\n"
-        )
+        (tmp_path / half / "halves" / f"agent-{half}0.log").write_text(f"2026-01-01 00:00:00 from {half}\n")
     mine = {"folder": str(tmp_path / "a/halves"), "pid": os.getpid(), "started_s": _started_s(os.getpid())}
     (tmp_path / "state/runs/other.json").write_text(json.dumps(mine))
-    for folder, path in ((tmp_path, "a/halves"), (tmp_path / "a", "../a/halves")):
+    for folder, path in ((tmp_path / "a", "../a/halves"), (tmp_path, "a/halves")):
         monkeypatch.chdir(folder)
         for name, halves in (("halves", {"a", "b"}), (None, {"a", "b"}), (path, {"a"})):
             assert {part.folder.parent.name for part in _chosen(name, only=True)} == halves
     told = swarm("logs --run halves")[1]
     assert ("from a" in told, "from b" in told) == (True, True)
     assert find_swarm(name="halves")[0][0] == "halves"
+    (tmp_path / "b/halves/run.json").write_text('{"scenario": "another"}')
+    with pytest.raises(ConfigError, match="found 2 runs called 'halves', expected the folder of one: /"):
+        _chosen("halves")
 
 
 @pytest.mark.parametrize("change", [{"pid": NOBODY}, {"started_s": 0.5}])
