@@ -15,7 +15,7 @@ from launch_scripts import typer_commands
 from launch_scripts.typer_commands import ADMIN, CONTEXT, LEFT, ORDER, PREPARE, Family, run_command
 
 LEAVES = (
-    "run_commands:app", "scenario_commands:app", "status_commands:app",
+    "run_commands:app", "scenario_commands:app", "observe_commands:app",
     "order_commands:short", "simulation_commands:app", "role_commands:app",
 )  # fmt: skip
 """Apps of commands without a family, in `launch_scripts.commands`."""
