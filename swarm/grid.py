@@ -207,11 +207,7 @@ class GridSpec:
 
     def terrain_cell(self, cell: Cells) -> Cells:
         """The cell of the terrain that holds a cell, or those that hold an array of cells."""
-        parts, cols = self.parts, self.cols
-        if parts == 1:
-            return cell
-        found: Cells = cell // cols // parts * (cols // parts) + cell % cols // parts
-        return found
+        return cell
 
     def middle(self, terrain_cell: int) -> int:
         """The cell in the middle of a cell of the terrain."""
@@ -337,6 +333,10 @@ class TrafficGrid(GridSpec):
     """
 
     parts: int = 1
+
+    def terrain_cell(self, cell: Cells) -> Cells:
+        found: Cells = cell // self.cols // self.parts * (self.cols // self.parts) + cell % self.cols // self.parts
+        return found
 
 
 _CODES = bytes(range(8))
