@@ -164,8 +164,7 @@ def _of_kind(kernels: Iterable[Kernel | StepKernel], *kinds: bool) -> list[Kerne
 
 
 def name_of(kernel: Kernel) -> str:
-    name: str = kernel.__name__
-    return name
+    return str(kernel.__name__)
 
 
 def missing(kernels: Iterable[Kernel]) -> list[Kernel]:
@@ -213,7 +212,8 @@ def build(kernels: Iterable[Kernel], report: Callable[[Kernel], None] = lambda _
 @contextlib.contextmanager
 def _locked(path: Path, how: int, remove: bool = True) -> Iterator[bool]:
     """Returns True if the lock was acquired. A file that is removed leaves two processes with a lock each, at
-    worst."""
+    worst. The folder may have been removed, too."""
+    path.parent.mkdir(parents=True, exist_ok=True)
     with path.open("wb") as file:
         try:
             fcntl.flock(file, how)

@@ -181,7 +181,7 @@ def _line(trial: Trial, result: Result) -> str:
     text = (
         f"{'FAILED' if result.broken else 'held  '} {trial.world} seed {trial.seed}: "
         f"longest wait {figures['longest_wait_s']:.1f} s, routed after {routed}, "
-        f"{figures.get('captures', 0):.0f} captures, {result.wall_s:.0f} s"
+        f"{number_of(round(figures.get('captures', 0)), 'capture')}, {result.wall_s:.0f} s"
     )
     return "\n".join([text, *(f"    {law}" for law in result.broken)])
 

@@ -23,7 +23,7 @@ from launch_scripts.observe.run_folders import pids_of
 from launch_scripts.observe.run_observer import OutsideObserver, frame_of_members
 from launch_scripts.observe.run_state import RunState, state_of
 from launch_scripts.observe.summed_counts import ProcessLoad, gaps_to
-from launch_scripts.plain_text import plain, unanswered
+from launch_scripts.plain_text import number_of, plain, unanswered
 from launch_scripts.process_table import ROLES
 from launch_scripts.stop_requests import stop_requests
 from shared_map.terrain.map_frame import MapFrame
@@ -120,7 +120,7 @@ def observed(bus: Bus, where: Where, least_s: float = _LISTEN_S, show: Progress 
     clock, observer = MonotonicClock(), OutsideObserver(bus)
     began_s = time.monotonic()
     while (spent_s := time.monotonic() - began_s) < _MOST_S and not (spent_s >= least_s and observer.whole):
-        show(f"asking the swarm: {len(observer.answers)} processes have answered", spent_s / _MOST_S)
+        show(f"asking the swarm: {number_of(len(observer.answers), 'answer')}", spent_s / _MOST_S)
         observer.listen(clock, 0.1)
     if observer.latest is None:
         admitted = "" if where.tls_ca is None else ", and does the router admit this certificate"

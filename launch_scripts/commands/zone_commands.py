@@ -15,7 +15,7 @@ import typer
 from launch_scripts.commands.order_commands import print_obeyed
 from launch_scripts.commands.shared_options import AsJson, Where, duration
 from launch_scripts.observe.run_observer import frame_of_run
-from launch_scripts.plain_text import format_duration
+from launch_scripts.plain_text import format_duration, number_of
 from launch_scripts.typer_commands import command, family_app
 from shared_map.terrain.map_frame import MapFrame
 from swarm.config.ground import ZoneConfig
@@ -171,7 +171,7 @@ def _line(zone: Zone, frame: MapFrame) -> str:
     row0, col0, row1, col1 = zone.window
     kind = "lethal" if zone.pace_s_per_m is None else f"pace {zone.pace_s_per_m:g} s/m"
     end = "" if zone.until_ns is None else f", ends in {format_duration(max(zone.until_ns / 1e9 - time.time(), 0))}"
-    within = f"{zone.cells} cells in rows {row0}-{row1 - 1}, cols {col0}-{col1 - 1}"
+    within = f"{number_of(zone.cells, 'cell')} in rows {row0}-{row1 - 1}, cols {col0}-{col1 - 1}"
     ends = " to ".join(written(frame, cell) for cell in _ends(zone, frame))
     whom = "" if zone.vehicle_class is None else f" for {zone.vehicle_class}"
     return f"zone {zone.name}: {kind}{whom}, {within}{end}" + (f"; {ends}" if ends else "")

@@ -36,7 +36,7 @@ from launch_scripts.observe.palette import colours_of_groups, format_length, rgb
 from launch_scripts.observe.run_folders import REPORT_FILE, SCENARIO_FILE, read_report
 from launch_scripts.observe.run_state import WELL, count, grouped, left_behind
 from launch_scripts.observe.summed_counts import percent
-from launch_scripts.plain_text import first_of
+from launch_scripts.plain_text import first_of, number_of
 from launch_scripts.report.plots_and_figures import PLOTS, STYLE, cards, draw_plot, halo, headline, saved
 from launch_scripts.report.report_and_tracks import TABLES, TRACKS_FILE, RunTracks, Track, flat, read_tracks
 from launch_scripts.report.run_gis_layers import groups_of
@@ -329,7 +329,7 @@ def save_picture(path: Path, ground: GroundPicture, tracks: RunTracks, report: d
 
 
 def _draw_head(figure: Figure, report: dict[str, Any]) -> None:
-    title = f"{report['vehicles']} vehicles chase {report['targets']} targets"
+    title = f"{number_of(report['vehicles'], 'vehicle')}, {number_of(report['targets'], 'target')}"
     figure.text(0.033, 0.966, title, fontsize=21, fontweight="bold", va="center")
     facts = "   ·   ".join(headline(report, report["run_id"]))
     figure.text(0.033, 0.936, facts, fontsize=9, color=palette.FAINT, va="center")
@@ -378,7 +378,7 @@ def page_of(folder: Path, report: Mapping[str, Any]) -> str:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    environment.filters.update(percent=percent, count=count)
+    environment.filters.update(percent=percent, count=count, number_of=number_of)
     scenario = folder / SCENARIO_FILE
     recording = folder / "run.rrd"  # without a byte where the monitor ended before it drew anything
     notes = list(report.get("notes") or [])

@@ -105,7 +105,7 @@ class Host(Holdings):
             if now_ns - heard_ns > _UNLED_NS and (vehicles := views[shard].seen):
                 members = self.shards.members(shard)
                 reasons[shard] = (
-                    f"{len(vehicles)} vehicles of this agent wait: the agents which grant the next cells "
+                    f"vehicles of this agent wait ({len(vehicles)}): the agents which grant the next cells "
                     f"({', '.join(members)}) do not answer, or too late; {self.shards.majority} of them must"
                 )
         return reasons
