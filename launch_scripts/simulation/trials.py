@@ -38,8 +38,8 @@ _SLOW_SEEDS = (6, 7)
 _SLOWEST_MS = 1000.0
 """Greatest delay of a slow link. Chosen, not measured."""
 _MORE_DELAYS = 12
-"""A slow seed is quiet for longer, by so many delays: an agent that was cut off and started again takes seven round
-trips until its vehicles have routes."""
+"""Delays of its link by which a slow seed is quiet longer: an agent that was cut off and started again takes seven
+round trips until its vehicles have routes."""
 
 _PACKAGES = (
     "swarm",
