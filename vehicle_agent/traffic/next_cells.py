@@ -189,7 +189,8 @@ class Steering:
             cost[ahead[0]] = min(cost[ahead[0]], stays - _LEAST_GAIN)
         wants = sorted(cost, key=lambda cell: (cell in one_way, cost[cell], hash((lot, cell))))
         better = sum(cost[cell] < stays and cell not in one_way for cell in wants)
-        return CellRequest(ahead, wants, len(wants) if pushed_ms else better, age_ms)
+        # One that can only stay, as beside an obstacle on its goal, is not older than those that could go on.
+        return CellRequest(ahead, wants, len(wants) if pushed_ms else better, age_ms if better else pushed_ms)
 
     def threatened(self, cell: int) -> bool:
         """Returns True if an obstacle is on a cell or approaches it: a vehicle there makes way before all

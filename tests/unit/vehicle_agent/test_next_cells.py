@@ -162,7 +162,7 @@ def test_who_comes_to_rest_on_its_route_goes_on_however_that_winds(seed: int, re
     vehicle.route.begin(cells, [start])
     for here, after in pairwise(cells):
         asked = steering.request(vehicle, [here], 0, 1, (), lambda *_: False, seed)
-        assert asked.better > 0
+        assert asked.better > 0 < asked.age_ms
         assert asked.ahead[0] == after
         assert asked.wants[0] == after or climb is None  # there another cell may be as good
         # A vehicle in the way is pushed on, or passed; to stay is no answer.
@@ -170,6 +170,8 @@ def test_who_comes_to_rest_on_its_route_goes_on_however_that_winds(seed: int, re
             after in steering.request(vehicle, [here], 0, 1, {after}, lambda *_: False, seed).wants[: asked.better]
         )
         vehicle.route.moved(after)
+    asked = steering.request(vehicle, [target], 0, 9, (), lambda *_: False, seed)
+    assert (asked.better, asked.age_ms) == (0, 0), "it can only stay, and goes after those which could go on"
 
 
 @given(st.integers(0, 1 << 32), st.booleans())
